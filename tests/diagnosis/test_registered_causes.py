@@ -20,7 +20,7 @@ from greybox.model.run.simulation import simulate
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses
 from greybox.trial.log import make_log
-from greybox.vessel.toml import load_vessel
+from greybox.vessel.toml import load_vessel, vessel_from_dict
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "causes.md").read_text(encoding="utf-8")
 
@@ -123,3 +123,23 @@ def test_lacking_terms_have_the_names_that_the_extended_structure_gives_them():
         for hypothesis in cause.hypotheses(context):
             terms = [n for n in hypothesis.columns if not n.startswith("current_")]
             assert set(terms) <= set(linear.with_terms(*terms).parameters), hypothesis.key
+
+
+def test_forces_that_no_thruster_makes_are_not_lacking():
+    """Two fixed propellers side by side steer without pushing aside."""
+    fixed = vessel_from_dict(
+        {
+            "name": "catamaran",
+            "length": 2.0,
+            "mass": 100.0,
+            "thruster": [
+                {"type": "fixed", "x": -1.0, "y": y, "speed": name, "angle": 0.0}
+                for name, y in (("n_port", -0.4), ("n_starboard", 0.4))
+            ],
+        }
+    )
+    thesis = load_vessel("thesis")
+    for vessel, lacks in ((fixed, False), (thesis, True)):
+        context = Context(get_structure("linear"), vessel, ("u", "v", "r"), False, 900.0, 1.0, {})
+        assert ("N_tauy" in context.lacking("N_tauy", "Y_taun")) == lacks
+        assert "Y_taun" in context.lacking("N_tauy", "Y_taun")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.model.structure import Structure
 from greybox.notebook import DisplayMixin, table
+from greybox.vessel.force import force_inputs
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -66,6 +67,10 @@ class Context:
 
         keys = {t.key for t in self.structure.terms}
         signals = {*self.structure.states, *self.structure.inputs, "uq", "vq", "uc", "vc"}
+        made = force_inputs(self.vessel)
+        if "taun" in made and "tauy" not in made:
+            # fixed thrusters side by side steer and never push aside
+            signals.discard("tauy")
         out = []
         for name in terms:
             term = parse_term(name)
