@@ -38,7 +38,9 @@ from greybox import diagnose, load_vessel, read_log
 from greybox.diagnosis.budget import nearest
 from greybox.diagnosis.preparing import prepare
 from greybox.numerics.binomial import wilson_interval
+from greybox.selection.estimate import estimate_model
 from greybox.trial.log import TrialLog
+from greybox.validation.fit import mean_fit, run_model
 
 TRIALS = ("random", "zigzag-20", "turn-port-15", "random")
 HELD_OUT = 2
@@ -241,8 +243,18 @@ def case(name: str, effect: str, seed: int, switches: Sequence[str]) -> dict[str
         "headline": bool(true & {*ids}) if ids else bool(true & {c for g in groups for c in g}),
         "wrong": sorted({*ids} - true - held), "numbers": numbers,
         "gain": {k: (g["before"], g["after"]) for k, g in found["gain"].items()},
+        "estimate": _fits(logs),
         "seconds": time.perf_counter() - begun,
     }  # fmt: skip
+
+
+def _fits(logs: Sequence[TrialLog]) -> list[float]:
+    """Return what `estimate` by default fits of each held-out log, mean of the channels."""
+    model = estimate_model(logs[:-HELD_OUT]).model()
+    return [
+        mean_fit(run_model(model, replace(log, vessel=model.vessel)).fit)
+        for log in logs[-HELD_OUT:]
+    ]
 
 
 def _budget(
@@ -268,7 +280,16 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             f"({100 * low:.0f}-{100 * high:.0f})"
         )
 
+    def fit(what: str, values: Sequence[float]) -> str:
+        """Return the median, and the range of the half in the middle."""
+        low, half, high = np.quantile(values, [0.25, 0.5, 0.75]) if values else [np.nan] * 3
+        return f"{what:<58}{half:5.1f} % ({low:.1f} to {high:.1f}), {len(values)} cases"
+
     counted = [r for r in rows if r["counts"]]
+    before, after = (
+        [float(np.mean([pair[k] for pair in r["gain"].values()])) for r in rows if r["gain"]]
+        for k in (0, 1)
+    )
     shares = [b for r in counted for b in r["budget"]]
     inside = [abs(v - t) <= 1.96 * s for r in rows for _, v, s, t in r["numbers"]]
     return "\n".join(
@@ -283,6 +304,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
                  [abs(told - true) <= 0.1 for true, told, _, _ in shares]),
             line("95 % intervals that hold the share",
                  [low <= true <= high for true, _, low, high in shares]),
+            fit("held-out fit of the base: median (quarters)", before),
+            fit("of the extended model", after),
+            fit("of estimate", [float(np.mean(r["estimate"])) for r in rows if "estimate" in r]),
         ]
     )  # fmt: skip
 
