@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.linear import Linear, means, slopes_of, with_zeros
+from greybox.diagnosis.linear import Linear, Slopes, means, slopes_of, with_zeros
 from greybox.model.run.kernels import FreeRunKernel
 from greybox.model.run.step import StepModel
 
@@ -53,12 +53,14 @@ class VaryingSimulator:
     def __init__(self, step: StepModel, samples: int) -> None:
         self._step, self._samples = step, samples
         self._kernels: dict[tuple[Active, bool], FreeRunKernel] = {}
+        # shared by runs of all lengths, and found sooner than by the hash of a structure
+        self._slopes: dict[Active, Slopes] = {}
         self._theta, self._drivers = np.zeros(0), np.zeros((0, 0))
         self._active: Active = ()
 
     def __getstate__(self) -> dict[str, object]:
         """Drop what belongs to one process when pickled."""
-        return self.__dict__ | {"_kernels": {}}
+        return self.__dict__ | {"_kernels": {}, "_slopes": {}}
 
     def _kernel(self, changing: bool) -> FreeRunKernel:
         key = (self._active, changing)
@@ -116,5 +118,10 @@ class VaryingSimulator:
         places : ndarray of int
             (m,) coefficients, and past them the current north and east.
         """
-        slopes = slopes_of(self._step, self._active)
+        slopes = self._slopes.pop(self._active, None)
+        if slopes is None:
+            slopes = slopes_of(self._step, self._active)
+        self._slopes[self._active] = slopes
+        if len(self._slopes) > _KEPT:
+            del self._slopes[next(iter(self._slopes))]
         return slopes(x, self._drivers, self._theta, places)

@@ -125,15 +125,19 @@ class _Runs:
         self._read = np.ascontiguousarray(read, float)
         self._evaluate = _Evaluator()
         self._blocks: dict[bool, list[tuple[slice, Array, dict[int, Any]]]] = {}
+        # those of the module are found by the hash of a model, which takes longer
+        self._along: ca.Function | None = None
+        self._tables: dict[bool, _Table] = {}
 
     def __call__(
         self, carried: Sequence[Array], constant: Sequence[Array]
     ) -> tuple[list[Array], list[Array]]:
         """Return what is carried after each step, and what is found, each (M, m, ·)."""
-        of = self._build(self._model)
-        function = _along_runs(self._build, self._model, self.steps, self.runs)
-        out = [np.empty((self.runs, self.steps, x.numel())) for x in (*of.next, *of.results)]
-        self._evaluate(function, (*carried, self._read, *constant), tuple(out))
+        if self._along is None:
+            self._along = _along_runs(self._build, self._model, self.steps, self.runs)
+        shapes = map(self._along.size1_out, range(self._along.n_out()))
+        out = [np.empty((self.runs, self.steps, size)) for size in shapes]
+        self._evaluate(self._along, (*carried, self._read, *constant), tuple(out))
         return out[: len(carried)], out[len(carried) :]
 
     def _prepared(
@@ -178,7 +182,9 @@ class _Runs:
             Of what is found first, (M, m, ny, q + nz), and of the states after the last
             step, (M, nz, q + nz).
         """
-        table = _table(self._build, self._model, starts)
+        if starts not in self._tables:
+            self._tables[starts] = _table(self._build, self._model, starts)
+        table = self._tables[starts]
         (rows, columns), nz = table.shape, table.states
         wanted: list[int] | None = None
         if only is not None:
