@@ -248,9 +248,14 @@ class Likelihood:
     def __init__(self, parts: Sequence[Array], rest: tuple[Array, float, float]) -> None:
         self.parts, self.rest, self.k = parts, rest, parts[0].shape[1]
         self.samples = sum(map(len, parts))
+        self._last: tuple[Array, tuple[Array, Array, Array]] | None = None
 
     def _transfer(self, x: Array) -> tuple[Array, Array, Array]:
-        return _transfer(self.k, np.array(_filter(self.k)(x, *self.rest)[0])[:, 0])
+        # slopes are asked for where a value was found
+        if self._last is None or not np.array_equal(self._last[0], x):
+            found = _transfer(self.k, np.array(_filter(self.k)(x, *self.rest)[0])[:, 0])
+            self._last = (x, found)
+        return self._last[1]
 
     def value(self, x: Array) -> float:
         """Return −2 log L at x, and the price of a memory far from what is usual."""

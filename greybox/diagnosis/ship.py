@@ -30,6 +30,8 @@ Wire = tuple[str, str, float]
 CURRENTS = ("current_north", "current_east")
 # vessels whose forces are kept: the ship of a run, and both ends of a step in a number of hers
 _VESSELS = 8
+# runs that are kept: a fit comes back to where a step began that led nowhere
+_RUNS = 4
 
 
 @dataclass(frozen=True)
@@ -157,12 +159,12 @@ class LogRun:
         step = StepModel(structure, integrator, air_measured=self.air_measured)
         self._simulator = VaryingSimulator(step, len(log))
         self._forces: deque[tuple[Vessel, tuple[Wire, ...], Array]] = deque(maxlen=_VESSELS)
-        self._last: tuple[Ship, Shown] | None = None
+        self._last: deque[tuple[Ship, Array, Array]] = deque(maxlen=_RUNS)
 
     def measuring(self, y: Array) -> LogRun:
         """Return the log with other outputs (N, ny)."""
         other = copy.copy(self)
-        other.y, other._last = y, None
+        other.y, other._last = y, deque(maxlen=_RUNS)
         channels = dict(zip(self.outputs, y.T, strict=True))
         other.log = replace(self.log, channels={**self.log.channels, **channels})
         return other
@@ -200,17 +202,20 @@ class LogRun:
 
     def run(self, ship: Ship, start: Array) -> Shown:
         """Run freely from a start (nx [+ 1],), the initial heading last."""
-        if self._last is not None and _as_before(self._last[0], self._last[1].start, ship, start):
-            # sensors do not move a ship
-            x = self._last[1].x
-        else:
-            tau = self.forces(ship.vessel, ship.wires)
-            current = np.broadcast_to(ship.current, (self.samples, 2))
-            drivers = np.column_stack([tau, self._psi, self._air, current])
-            x = self._simulator(start[: len(self.states)], drivers, self.parameters(ship))
-        shown = self._as_shown(ship, x, start)
-        self._last = (ship, shown)
-        return shown
+        # sensors do not move a ship, nor does the heading that she begins with
+        begun = start[: len(self.states)]
+        same = (x for s, first, x in reversed(self._last) if _as_before(s, first, ship, begun))
+        x = next(same, None)
+        if x is None:
+            x = self._simulator(begun, self._drivers(ship), self.parameters(ship))
+            self._last.append((ship, begun, x))
+        return self._as_shown(ship, x, start)
+
+    def _drivers(self, ship: Ship) -> Array:
+        """Return what the simulator reads of a ship, (N, nu + 5)."""
+        current = np.broadcast_to(ship.current, (self.samples, 2))
+        tau = self.forces(ship.vessel, ship.wires)
+        return np.column_stack([tau, self._psi, self._air, current])
 
     def _as_shown(self, ship: Ship, x: Array, start: Array) -> Shown:
         if not np.isfinite(x).all():
@@ -302,15 +307,23 @@ class LogRun:
         return y
 
     def linearise(self, ship: Ship, shown: Shown, places: NDArray[np.int_]) -> Linear:
-        """Return the derivatives along the run that was made last.
+        """Return the derivatives along a run.
 
         Parameters
         ----------
+        ship : Ship
+        shown : Shown
+            Its run.
         places : ndarray of int
             (m,) coefficients, and past them the current north and east.
         """
-        linear = self._simulator.linearise(shown.x, places)
+        linear = self._linear(ship, shown, places)
         return Linear(linear.a, self._changed(ship, linear.driven, places))
+
+    def _linear(self, ship: Ship, shown: Shown, places: NDArray[np.int_]) -> Linear:
+        return self._simulator.linearise(
+            shown.x, self._drivers(ship), self.parameters(ship), places
+        )
 
     def _changed(self, ship: Ship, driven: Array, places: NDArray[np.int_]) -> Array:
         """Return derivatives in coefficients as they are before they change along the log."""
@@ -334,7 +347,7 @@ class LogRun:
         ----------
         ship : Ship
         shown : Shown
-            Its run, made last.
+            Its run.
         places : ndarray of int
             (m,)
         ways : sequence of (Ship, Ship)
@@ -348,7 +361,7 @@ class LogRun:
         moved = [self._moved(*way) for way in ways]
         m = len(places)
         needed = np.unique(np.concatenate([places, *(at for at, _ in moved)])).astype(int)
-        linear = self._simulator.linearise(shown.x, needed)
+        linear = self._linear(ship, shown, needed)
         driven = np.empty((*linear.driven.shape[:2], m + len(ways)))
         own = linear.driven[:, :, np.searchsorted(needed, places)]
         driven[:, :, :m] = self._changed(ship, own, places)

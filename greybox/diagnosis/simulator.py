@@ -55,15 +55,13 @@ class VaryingSimulator:
         self._kernels: dict[tuple[Active, bool], FreeRunKernel] = {}
         # shared by runs of all lengths, and found sooner than by the hash of a structure
         self._slopes: dict[Active, Slopes] = {}
-        self._theta, self._drivers = np.zeros(0), np.zeros((0, 0))
-        self._active: Active = ()
 
     def __getstate__(self) -> dict[str, object]:
         """Drop what belongs to one process when pickled."""
         return self.__dict__ | {"_kernels": {}, "_slopes": {}}
 
-    def _kernel(self, changing: bool) -> FreeRunKernel:
-        key = (self._active, changing)
+    def _kernel(self, active: Active, changing: bool) -> FreeRunKernel:
+        key = (active, changing)
         # the sets of terms that are compared come again and again; those of old steps do not
         kernel = self._kernels.pop(key, None)
         if kernel is None:
@@ -91,11 +89,9 @@ class VaryingSimulator:
         ndarray
             (N, nx); infinite where the run escaped.
         """
-        self._drivers, self._theta = drivers, theta
         changing = theta.ndim == 2
-        used = np.flatnonzero(theta.any(axis=0) if changing else theta)
-        self._active = tuple(used.tolist())
-        kernel, split = self._kernel(changing), drivers.shape[1]
+        used = _used(theta)
+        kernel, split = self._kernel(tuple(used.tolist()), changing), drivers.shape[1]
         kernel.read[:, :split] = drivers[:-1]
         if changing:
             kernel.read[:, split:] = theta[:-1, used]
@@ -108,20 +104,28 @@ class VaryingSimulator:
                 out = np.full_like(out, np.inf)
         return out
 
-    def linearise(self, x: Array, places: NDArray[np.int_]) -> Linear:
-        """Return the derivatives along the run that was made last.
+    def linearise(self, x: Array, drivers: Array, theta: Array, places: NDArray[np.int_]) -> Linear:
+        """Return the derivatives along a run.
 
         Parameters
         ----------
         x : ndarray
             (N, nx)
+        drivers, theta : ndarray
+            That it was made with.
         places : ndarray of int
             (m,) coefficients, and past them the current north and east.
         """
-        slopes = self._slopes.pop(self._active, None)
+        active = tuple(_used(theta).tolist())
+        slopes = self._slopes.pop(active, None)
         if slopes is None:
-            slopes = slopes_of(self._step, self._active)
-        self._slopes[self._active] = slopes
+            slopes = slopes_of(self._step, active)
+        self._slopes[active] = slopes
         if len(self._slopes) > _KEPT:
             del self._slopes[next(iter(self._slopes))]
-        return slopes(x, self._drivers, self._theta, places)
+        return slopes(x, drivers, theta, places)
+
+
+def _used(theta: Array) -> NDArray[np.int_]:
+    """Return which coefficients are not zero all along."""
+    return np.flatnonzero(theta.any(axis=0) if theta.ndim == 2 else theta)
