@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 
 # samples whose derivatives are computed at once: a long log needs no more memory than these
 _BLOCK = 8192
+# and that are turned from rows to columns at once: what is read stays in a processor's memory
+_NEAR = 128
 
 
 @lru_cache(maxsize=32)
@@ -83,6 +85,14 @@ def _table(build: StepBuilder, model: OutputModel, starts: bool) -> _Table:
 def _samples(x: Array) -> Array:
     """Return what runs hold (M, m, n) as one row of all samples for each (n, M·m)."""
     return np.ascontiguousarray(x.reshape(-1, x.shape[2]).T)
+
+
+def _by_sample(rows: Array) -> Array:
+    """Return rows (n, N) as columns (N, n), so few samples at once that they stay near."""
+    out = np.empty(rows.shape[::-1])
+    for first in range(0, len(out), _NEAR):
+        out[first : first + _NEAR] = rows[:, first : first + _NEAR].T
+    return out
 
 
 class _Evaluator:
@@ -206,10 +216,10 @@ class _Runs:
             slope[:, :, columns - 2 * nz :] = np.eye(nz)
         with np.errstate(all="ignore"):
             for block, read, known in self._prepared(table, states.shape[2], starts):
-                matrix = np.empty((read.shape[1], rows * columns))
                 arguments = [*_samples(states[:, block]), *read, *fixed]
-                table.program(arguments, matrix.T, known, wanted)
-                by = matrix.reshape(self.runs, -1, rows, columns)
+                found_at = np.empty((rows * columns, read.shape[1]))
+                table.program(arguments, found_at, known, wanted)
+                by = _by_sample(found_at).reshape(self.runs, -1, rows, columns)
                 slopes = propagate(by[:, :, :nz, :nz], by[:, :, :nz, nz:], slope)
                 slope = slopes[:, -1]
                 if table.same:
