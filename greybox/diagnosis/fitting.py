@@ -14,7 +14,7 @@ from greybox.diagnosis.linear import NOWHERE
 from greybox.diagnosis.noise import Noise, fit_noise, free_run_noise
 from greybox.diagnosis.normal import bounded_step, inverse
 from greybox.diagnosis.point import Fit, Point
-from greybox.diagnosis.ship import CURRENTS, LogRun
+from greybox.diagnosis.ship import CURRENTS, LogRun, Ship
 from greybox.model.disturbances import turn_bounds
 from greybox.numerics.lagged_moments import automatic_lags, bartlett_sums
 
@@ -45,20 +45,37 @@ def groups_of(run: LogRun) -> list[tuple[int, ...]]:
     return out
 
 
+# derivatives (N, ny, m) of a log's outputs in those of the free numbers that move them, and
+# where these m stand among all
+_Own = tuple[Array, NDArray[np.int_]]
+
+
 @dataclass(frozen=True)
 class _Normal:
-    """Whitened derivatives (n, q) at a vector (q,) of free numbers, and their squares (q, q)."""
+    """Whitened derivatives of each log at a vector (q,) of free numbers, their squares (q, q)."""
 
     at: Array
-    rows: Array
+    rows: tuple[_Own, ...]
     matrix: Array
 
     @classmethod
-    def of(cls, at: Array, noise: Noise, slopes: Sequence[Array]) -> _Normal:
+    def of(cls, at: Array, noise: Noise, slopes: Sequence[_Own]) -> _Normal:
+        matrix = np.zeros((len(at), len(at)))
         # of a run at the edge of stability the derivatives may leave every number's range
         with np.errstate(over="ignore", invalid="ignore"):
-            rows = np.concatenate([noise.whiten(s).reshape(-1, s.shape[2]) for s in slopes])
-            return cls(at, rows, rows.T @ rows)
+            rows = tuple((noise.whiten(slope), where) for slope, where in slopes)
+            for own, where in rows:
+                by_channel = own.transpose(1, 2, 0)
+                matrix[np.ix_(where, where)] += sum(r @ r.T for r in by_channel)
+        return cls(at, rows, matrix)
+
+    def gradient(self, nu: Sequence[Array]) -> Array:
+        """Return what innovations (N, ny) of each log lie along the derivatives, (q,)."""
+        out = np.zeros(len(self.at))
+        for (own, where), seen in zip(self.rows, nu, strict=True):
+            by_channel = zip(own.transpose(1, 2, 0), seen.T, strict=True)
+            out[where] += sum(r @ n for r, n in by_channel)
+        return out
 
     def near(self, vector: Array) -> bool:
         """Whether these derivatives do for a vector, too."""
@@ -85,7 +102,7 @@ class Problem:
         self.sample_time = runs[0].sample_time
         self.groups = groups_of(runs[0])
         self.names = (*self.structure.parameters, *CURRENTS)
-        self._known: tuple[Point, list[Array]] | None = None
+        self._known: tuple[Point, list[_Own]] | None = None
 
     def place(self, name: str) -> int:
         """Return the index of a coefficient or current."""
@@ -186,31 +203,43 @@ class Problem:
 
     def slopes(self, point: Point) -> list[Array]:
         """Return derivatives of the outputs in the free numbers, (N, ny, q) per log."""
+        q = len(point.vector())
+        out = []
+        for own, where in self.own_slopes(point):
+            samples, outputs, _ = own.shape
+            full = np.zeros((outputs, q, samples)).transpose(2, 0, 1)
+            full[:, :, where] = own
+            out.append(full)
+        return out
+
+    def own_slopes(self, point: Point) -> list[_Own]:
+        """Return the derivatives of each log that may not be zero, and where in `slopes` they are.
+
+        Those in the starts of other logs are left out.
+        """
         ship = point.ship
         places = np.array(point.places, int)
-        own, starts = len(places), sum(map(len, point.starts))
-        inner = sum(map(len, point.values))
         vector = point.vector()
+        first = len(places)
+        ways: list[tuple[Ship, Ship]] = []
+        lengths = []
+        for hypothesis, value in zip(point.hypotheses, point.values, strict=True):
+            for parameter in hypothesis.parameters[: len(value)]:
+                k = first + len(ways)
+                step = parameter.step * np.array([-1, 1])
+                ends = np.clip(vector[k] + step, parameter.low, parameter.high)
+                one, two = (point.at(_with(vector, k, end)).ship for end in ends)
+                ways.append((one, two))
+                lengths.append(ends[1] - ends[0])
+        inner = slice(first, first + len(ways))
+        before = inner.stop
         out = []
-        before = 0
         for run, start in zip(self.runs, point.starts, strict=True):
-            shown = run.run(ship, start)
-            slopes = run.columns(ship, shown, places)
-            rows = np.zeros((run.samples, slopes.shape[1], own + inner + starts))
-            rows[:, :, :own] = slopes[:, :, :own]
-            first = own + inner + before
-            rows[:, :, first : first + len(start)] = slopes[:, :, own:]
+            slopes = run.columns(ship, run.run(ship, start), places, ways)
+            slopes[:, :, inner] /= np.array(lengths)
+            starts = np.arange(before, before + len(start))
+            out.append((slopes, np.concatenate([np.arange(inner.stop), starts])))
             before += len(start)
-            k = own
-            for hypothesis, value in zip(point.hypotheses, point.values, strict=True):
-                for parameter in hypothesis.parameters[: len(value)]:
-                    step = parameter.step * np.array([-1, 1])
-                    ends = np.clip(vector[k] + step, parameter.low, parameter.high)
-                    ships = [point.at(_with(vector, k, end)).ship for end in ends]
-                    change = run.difference(ship, shown, *ships)
-                    rows[:, :, k] = change / (ends[1] - ends[0])
-                    k += 1
-            out.append(rows)
         return out
 
     def fit(self, point: Point, noise: Noise, most: int = _MOST) -> Fit:
@@ -230,7 +259,7 @@ class Problem:
                 normal = self._normal(point, vector, noise)
             if not np.isfinite(normal.matrix).all():
                 break
-            gradient = normal.rows.T @ np.concatenate([n.ravel() for n in nu])
+            gradient = normal.gradient(nu)
             accepted = False
             while damping <= _DAMPING_LIMIT:
                 step = bounded_step(normal.matrix, gradient, low - vector, high - vector, damping)
@@ -265,7 +294,7 @@ class Problem:
             normal = _Normal.of(known[0].vector(), noise, known[1])
             if normal.near(vector):
                 return normal
-        self._known = (point, self.slopes(point))
+        self._known = (point, self.own_slopes(point))
         return _Normal.of(vector, noise, self._known[1])
 
     def profile(self, fit: Fit, k: int, values: Array) -> Array:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.normal import bounded_step
+from greybox.numerics.recursion import filtered
 from greybox.numerics.robust import white_noise
 
 Array = NDArray[np.float64]
@@ -77,16 +78,13 @@ class NoiseModel:
         e : ndarray
             (N, k, m) errors or sensitivities of this group's outputs.
         """
-        from scipy.signal import lfilter
+        return np.stack(self.innovations(list(e.transpose(1, 2, 0)))).transpose(2, 0, 1)
 
+    def innovations(self, channels: Sequence[Array]) -> list[Array]:
+        """Return innovations of unit variance, (m, N) of each channel, of channels (m, N)."""
         if len(self.denominator) == 1:
-            return np.asarray(e * np.diag(self.numerators[:, :, 0])[:, None])
-        out = np.zeros(e.shape)
-        for i, row in enumerate(self.numerators):
-            for j, numerator in enumerate(row):
-                if numerator.any():
-                    out[:, i] += lfilter(numerator, self.denominator, e[:, j], axis=0)
-        return out
+            return [self.numerators[i, i, 0] * e for i, e in enumerate(channels)]
+        return filtered(self.numerators, self.denominator, channels)
 
     @property
     def remembered(self) -> float:
@@ -121,10 +119,14 @@ class Noise:
 
     def whiten(self, e: Array) -> Array:
         """Return innovations (N, ny, m) of errors or sensitivities (N, ny, m)."""
-        out = np.empty_like(e)
+        # filters run along time, which is therefore last in memory
+        channels = e.transpose(1, 2, 0)
+        out = np.empty(channels.shape)
         for group in self.groups:
-            out[:, group.outputs] = group.whiten(e[:, group.outputs])
-        return out
+            found = group.innovations([channels[i] for i in group.outputs])
+            for i, nu in zip(group.outputs, found, strict=True):
+                out[i] = nu
+        return out.transpose(2, 0, 1)
 
     @property
     def coloured(self) -> bool:
@@ -246,9 +248,14 @@ class Likelihood:
     def __init__(self, parts: Sequence[Array], rest: tuple[Array, float, float]) -> None:
         self.parts, self.rest, self.k = parts, rest, parts[0].shape[1]
         self.samples = sum(map(len, parts))
+        self._last: tuple[Array, tuple[Array, Array, Array]] | None = None
 
     def _transfer(self, x: Array) -> tuple[Array, Array, Array]:
-        return _transfer(self.k, np.array(_filter(self.k)(x, *self.rest)[0])[:, 0])
+        # slopes are asked for where a value was found
+        if self._last is None or not np.array_equal(self._last[0], x):
+            found = _transfer(self.k, np.array(_filter(self.k)(x, *self.rest)[0])[:, 0])
+            self._last = (x, found)
+        return self._last[1]
 
     def value(self, x: Array) -> float:
         """Return −2 log L at x, and the price of a memory far from what is usual."""

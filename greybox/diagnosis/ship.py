@@ -7,6 +7,7 @@ their commands, a coefficient from some moment on, or how a sensor sees the moti
 from __future__ import annotations
 
 import copy
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -27,6 +28,10 @@ Array = NDArray[np.float64]
 # a command, the column that holds it, and its sign there
 Wire = tuple[str, str, float]
 CURRENTS = ("current_north", "current_east")
+# vessels whose forces are kept: the ship of a run, and both ends of a step in a number of hers
+_VESSELS = 8
+# runs that are kept: a fit comes back to where a step began that led nowhere
+_RUNS = 4
 
 
 @dataclass(frozen=True)
@@ -153,27 +158,28 @@ class LogRun:
         self._commands = {c: log[c] for c in log.vessel.commands}
         step = StepModel(structure, integrator, air_measured=self.air_measured)
         self._simulator = VaryingSimulator(step, len(log))
-        self._forces: tuple[Vessel, tuple[Wire, ...], Array] | None = None
-        self._last: tuple[Ship, Shown] | None = None
+        self._forces: deque[tuple[Vessel, tuple[Wire, ...], Array]] = deque(maxlen=_VESSELS)
+        self._last: deque[tuple[Ship, Array, Array]] = deque(maxlen=_RUNS)
 
     def measuring(self, y: Array) -> LogRun:
         """Return the log with other outputs (N, ny)."""
         other = copy.copy(self)
-        other.y, other._last = y, None
+        other.y, other._last = y, deque(maxlen=_RUNS)
         channels = dict(zip(self.outputs, y.T, strict=True))
         other.log = replace(self.log, channels={**self.log.channels, **channels})
         return other
 
     def forces(self, vessel: Vessel, wires: tuple[Wire, ...] = ()) -> Array:
         """Return the generalised inputs (N, nu) as the vessel's thrusters give them."""
-        known = self._forces
-        if known is None or known[0] is not vessel or known[1] != wires:
-            commands = wired(self._commands, wires)
-            made = actuated_force(vessel, commands, self.sample_time, self._logged_time)
-            zero = np.zeros(self.samples)
-            tau = np.column_stack([made.get(n, zero) for n in self.structure.inputs])
-            self._forces = known = (vessel, wires, tau)
-        return known[2]
+        for before, same, tau in reversed(self._forces):
+            if same == wires and (before is vessel or before == vessel):
+                return tau
+        commands = wired(self._commands, wires)
+        made = actuated_force(vessel, commands, self.sample_time, self._logged_time)
+        zero = np.zeros(self.samples)
+        tau = np.column_stack([made.get(n, zero) for n in self.structure.inputs])
+        self._forces.append((vessel, wires, tau))
+        return tau
 
     def weights(self, change: Change) -> Array:
         """Return the share of each step that lies after a change, (N,)."""
@@ -196,17 +202,20 @@ class LogRun:
 
     def run(self, ship: Ship, start: Array) -> Shown:
         """Run freely from a start (nx [+ 1],), the initial heading last."""
-        if self._last is not None and _as_before(self._last[0], self._last[1].start, ship, start):
-            # sensors do not move a ship
-            x = self._last[1].x
-        else:
-            tau = self.forces(ship.vessel, ship.wires)
-            current = np.broadcast_to(ship.current, (self.samples, 2))
-            drivers = np.column_stack([tau, self._psi, self._air, current])
-            x = self._simulator(start[: len(self.states)], drivers, self.parameters(ship))
-        shown = self._as_shown(ship, x, start)
-        self._last = (ship, shown)
-        return shown
+        # sensors do not move a ship, nor does the heading that she begins with
+        begun = start[: len(self.states)]
+        same = (x for s, first, x in reversed(self._last) if _as_before(s, first, ship, begun))
+        x = next(same, None)
+        if x is None:
+            x = self._simulator(begun, self._drivers(ship), self.parameters(ship))
+            self._last.append((ship, begun, x))
+        return self._as_shown(ship, x, start)
+
+    def _drivers(self, ship: Ship) -> Array:
+        """Return what the simulator reads of a ship, (N, nu + 5)."""
+        current = np.broadcast_to(ship.current, (self.samples, 2))
+        tau = self.forces(ship.vessel, ship.wires)
+        return np.column_stack([tau, self._psi, self._air, current])
 
     def _as_shown(self, ship: Ship, x: Array, start: Array) -> Shown:
         if not np.isfinite(x).all():
@@ -223,28 +232,19 @@ class LogRun:
         # a run tells nothing of what was before its first sample
         return self.y + self.within(sensors) * (y - self.y) if sensors.late else y
 
-    def difference(self, ship: Ship, shown: Shown, one: Ship, two: Ship) -> Array:
-        """Return how outputs change from one ship to another to first order, (N, ny).
-
-        Both lie near `ship`, whose run `shown` was made last.
-        """
-        slope = np.zeros((self.samples, len(self.states), 1))
-        tau = self.forces(two.vessel, two.wires) - self.forces(one.vessel, one.wires)
-        theta = np.broadcast_to(
-            self.parameters(two) - self.parameters(one), (self.samples, len(ship.theta))
-        )
-        current = np.broadcast_to(two.current - one.current, (self.samples, 2))
-        change = np.hstack([theta, current, tau])[:-1]
-        places = np.flatnonzero(change.any(axis=0))
-        if len(places):
-            linear = self._simulator.linearise(shown.x, places)
-            driven = np.einsum("nim,nm->ni", linear.driven, change[:, places])
-            slope = sensitivities(Linear(linear.a, driven[:, :, None]))[:, :, :1]
-        out = self.seen(ship, slope)[:, :, 0]
-        if one.sensors != two.sensors:
-            shows = [self._show(s.sensors, shown.x, shown.start) for s in (one, two)]
-            out = out + shows[1] - shows[0]
-        return np.asarray(out)
+    def _moved(self, one: Ship, two: Ship) -> tuple[NDArray[np.int_], Array]:
+        """Return the coefficients, currents and inputs in which ships differ, and how, (N, m)."""
+        tau = np.zeros(len(self.structure.inputs))
+        if one.vessel != two.vessel or one.wires != two.wires:
+            tau = self.forces(two.vessel, two.wires) - self.forces(one.vessel, one.wires)
+        theta = self.parameters(two) - self.parameters(one)
+        places, values, first = [], [], 0
+        for part in (theta, two.current - one.current, tau):
+            used = np.flatnonzero(part.any(axis=0) if part.ndim == 2 else part)
+            places.append(first + used)
+            values.append(np.broadcast_to(part[..., used], (self.samples, len(used))))
+            first += part.shape[-1]
+        return np.concatenate(places), np.hstack(values)
 
     def _across_gaps(self, y: Array) -> Array:
         """Return outputs (N, ny, ...) straight between the ends of gaps, level at the log's ends.
@@ -278,18 +278,18 @@ class LogRun:
             out[:, self.outputs.index(name)] = 1.0 - np.clip(beyond, 0.0, 1.0)
         return out
 
-    def _heading(self, r: Array) -> Array:
-        """Integrate a yaw rate (N, ...) from zero."""
+    def _heading(self, r: Array, axis: int = 0) -> Array:
+        """Integrate a yaw rate from zero along an axis of N."""
         # the mean of both ends is that of an RK4 step to second order
         rule: Rule = "trapezoid" if self.integrator == "rk4" else "euler"
-        return integrated(r, self.sample_time, rule)
+        return integrated(r, self.sample_time, rule, axis)
 
     def sense(self, sensors: Sensors, x: Array) -> Array:
         """Return what sensors show of motions (N, ny, m); linear in the motion."""
         names = self.outputs
         if sensors == Sensors():
             return x.copy()
-        y = x.copy()
+        y = x.copy(order="K")
         if "u" in names and "v" in names:
             iu, iv = names.index("u"), names.index("v")
             if "r" in names:
@@ -307,45 +307,88 @@ class LogRun:
         return y
 
     def linearise(self, ship: Ship, shown: Shown, places: NDArray[np.int_]) -> Linear:
-        """Return the derivatives along the run that was made last.
+        """Return the derivatives along a run.
 
         Parameters
         ----------
+        ship : Ship
+        shown : Shown
+            Its run.
         places : ndarray of int
             (m,) coefficients, and past them the current north and east.
         """
-        linear = self._simulator.linearise(shown.x, places)
+        linear = self._linear(ship, shown, places)
+        return Linear(linear.a, self._changed(ship, linear.driven, places))
+
+    def _linear(self, ship: Ship, shown: Shown, places: NDArray[np.int_]) -> Linear:
+        return self._simulator.linearise(
+            shown.x, self._drivers(ship), self.parameters(ship), places
+        )
+
+    def _changed(self, ship: Ship, driven: Array, places: NDArray[np.int_]) -> Array:
+        """Return derivatives in coefficients as they are before they change along the log."""
         for change in ship.changes:
             here = places == change.index
             if here.any():
                 factor = 1 + (change.factor - 1) * self.weights(change)[:-1]
-                linear.driven[:, :, here] *= factor[:, None, None]
-        return linear
+                driven[:, :, here] *= factor[:, None, None]
+        return driven
 
-    def columns(self, ship: Ship, shown: Shown, places: NDArray[np.int_]) -> Array:
-        """Return ∂y of coefficients and currents at `places`, then of the start.
+    def columns(
+        self,
+        ship: Ship,
+        shown: Shown,
+        places: NDArray[np.int_],
+        ways: Sequence[tuple[Ship, Ship]] = (),
+    ) -> Array:
+        """Return ∂y of coefficients and currents at `places`, then on ways, then of the start.
 
         Parameters
         ----------
+        ship : Ship
+        shown : Shown
+            Its run.
         places : ndarray of int
             (m,)
+        ways : sequence of (Ship, Ship)
+            From one ship near `ship` to another one near it: how outputs change to first order.
 
         Returns
         -------
         ndarray
-            (N, ny, m + nx [+ 1])
+            (N, ny, m + ways + nx [+ 1])
         """
-        return self.seen(ship, sensitivities(self.linearise(ship, shown, places)))
+        moved = [self._moved(*way) for way in ways]
+        m = len(places)
+        needed = np.unique(np.concatenate([places, *(at for at, _ in moved)])).astype(int)
+        linear = self._linear(ship, shown, needed)
+        driven = np.empty((*linear.driven.shape[:2], m + len(ways)))
+        own = linear.driven[:, :, np.searchsorted(needed, places)]
+        driven[:, :, :m] = self._changed(ship, own, places)
+        for k, (at, change) in enumerate(moved, m):
+            along = linear.driven[:, :, np.searchsorted(needed, at)]
+            driven[:, :, k] = np.einsum("nim,nm->ni", along, change[:-1])
+        out = self.seen(ship, sensitivities(Linear(linear.a, driven)))
+        for k, (one, two) in enumerate(ways, m):
+            if one.sensors != two.sensors:
+                shows = [self._show(s.sensors, shown.x, shown.start) for s in (one, two)]
+                out[:, :, k] += shows[1] - shows[0]
+        return out
 
     def seen(self, ship: Ship, slope: Array) -> Array:
         """Return ∂y (N, ny, m [+ 1]) of motions' derivatives ∂x (N, nx, m)."""
+        nx, m = slope.shape[1:]
+        extra = int(self._turns)
+        # time is last in memory: what follows runs along it
+        full = np.empty((nx + extra, m + extra, self.samples))
+        full[:nx, :m] = slope.transpose(1, 2, 0)
         if self._turns:
-            turned = self._heading(slope[:, self.states.index("r")])
-            slope = np.concatenate([slope, turned[:, None]], axis=1)
-            first = np.zeros((self.samples, slope.shape[1], 1))
-            first[:, -1] = 1.0
-            slope = np.concatenate([slope, first], axis=2)
-        y = self._across_gaps(self.sense(ship.sensors, slope))
+            full[:nx, m], full[nx, m] = 0.0, 1.0
+            full[nx, :m] = self._heading(full[self.states.index("r"), :m], axis=-1)
+        y = full.transpose(2, 0, 1)
+        if ship.sensors != Sensors():
+            y = self.sense(ship.sensors, y)
+        y = self._across_gaps(y)
         return y * self.within(ship.sensors)[:, :, None] if ship.sensors.late else y
 
 

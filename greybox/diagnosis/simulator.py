@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.linear import Linear, means, slopes_of, with_zeros
+from greybox.diagnosis.linear import Linear, Slopes, means, slopes_of, with_zeros
 from greybox.model.run.kernels import FreeRunKernel
 from greybox.model.run.step import StepModel
 
@@ -53,15 +53,15 @@ class VaryingSimulator:
     def __init__(self, step: StepModel, samples: int) -> None:
         self._step, self._samples = step, samples
         self._kernels: dict[tuple[Active, bool], FreeRunKernel] = {}
-        self._theta, self._drivers = np.zeros(0), np.zeros((0, 0))
-        self._active: Active = ()
+        # shared by runs of all lengths, and found sooner than by the hash of a structure
+        self._slopes: dict[Active, Slopes] = {}
 
     def __getstate__(self) -> dict[str, object]:
         """Drop what belongs to one process when pickled."""
-        return self.__dict__ | {"_kernels": {}}
+        return self.__dict__ | {"_kernels": {}, "_slopes": {}}
 
-    def _kernel(self, changing: bool) -> FreeRunKernel:
-        key = (self._active, changing)
+    def _kernel(self, active: Active, changing: bool) -> FreeRunKernel:
+        key = (active, changing)
         # the sets of terms that are compared come again and again; those of old steps do not
         kernel = self._kernels.pop(key, None)
         if kernel is None:
@@ -89,11 +89,9 @@ class VaryingSimulator:
         ndarray
             (N, nx); infinite where the run escaped.
         """
-        self._drivers, self._theta = drivers, theta
         changing = theta.ndim == 2
-        used = np.flatnonzero(theta.any(axis=0) if changing else theta)
-        self._active = tuple(used.tolist())
-        kernel, split = self._kernel(changing), drivers.shape[1]
+        used = _used(theta)
+        kernel, split = self._kernel(tuple(used.tolist()), changing), drivers.shape[1]
         kernel.read[:, :split] = drivers[:-1]
         if changing:
             kernel.read[:, split:] = theta[:-1, used]
@@ -106,15 +104,28 @@ class VaryingSimulator:
                 out = np.full_like(out, np.inf)
         return out
 
-    def linearise(self, x: Array, places: NDArray[np.int_]) -> Linear:
-        """Return the derivatives along the run that was made last.
+    def linearise(self, x: Array, drivers: Array, theta: Array, places: NDArray[np.int_]) -> Linear:
+        """Return the derivatives along a run.
 
         Parameters
         ----------
         x : ndarray
             (N, nx)
+        drivers, theta : ndarray
+            That it was made with.
         places : ndarray of int
             (m,) coefficients, and past them the current north and east.
         """
-        slopes = slopes_of(self._step, self._active)
-        return slopes(x, self._drivers, self._theta, places)
+        active = tuple(_used(theta).tolist())
+        slopes = self._slopes.pop(active, None)
+        if slopes is None:
+            slopes = slopes_of(self._step, active)
+        self._slopes[active] = slopes
+        if len(self._slopes) > _KEPT:
+            del self._slopes[next(iter(self._slopes))]
+        return slopes(x, drivers, theta, places)
+
+
+def _used(theta: Array) -> NDArray[np.int_]:
+    """Return which coefficients are not zero all along."""
+    return np.flatnonzero(theta.any(axis=0) if theta.ndim == 2 else theta)

@@ -8,6 +8,8 @@ recursion is one banded triangular system in all samples, which a library solves
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,8 @@ Array = NDArray[np.float64]
 _FEW = 8
 # from this many runs on a step of all of them together is work enough
 _MANY = 16
+# samples that a filter takes at once, and signals from which on that is the faster way
+_AT_ONCE, _SIGNALS = 32, 4
 
 
 def propagate(a: Array, b: Array, start: Array) -> Array:
@@ -65,6 +69,98 @@ def decay(share: float, b: Array) -> Array:
     band = np.vstack([np.ones(len(b)), np.full(len(b), -share)])
     solved, _ = dtbtrs(band, columns, uplo="L", diag="U", overwrite_b=True)
     return np.asarray(solved.reshape(b.shape))
+
+
+def filtered(numerators: Array, denominator: Array, channels: Sequence[Array]) -> list[Array]:
+    """Pass channels through a rational filter, from rest: y_i = Σ_j B_ij(q⁻¹)/A(q⁻¹) e_j.
+
+    Parameters
+    ----------
+    numerators : ndarray
+        (k, k, n+1) in powers of the delay.
+    denominator : ndarray
+        (n+1,) likewise, its first coefficient 1.
+    channels : sequence of ndarray
+        k of them, (m, N) of m signals each, time last.
+
+    Returns
+    -------
+    list of ndarray
+        (m, N) of each of the k outputs.
+    """
+    signals, samples = channels[0].shape
+    if signals >= _SIGNALS and samples > _AT_ONCE:
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = _by_blocks(numerators, denominator, channels)
+        # beyond the numbers' range a sample must not reach those before it
+        if all(np.isfinite(y[:, -1]).all() for y in found):
+            return found
+    from scipy.signal import lfilter
+
+    out = []
+    for row in numerators:
+        total = np.zeros((signals, samples))
+        for numerator, e in zip(row, channels, strict=True):
+            if numerator.any():
+                total += lfilter(numerator, denominator, e)
+        out.append(total)
+    return out
+
+
+def _by_blocks(numerators: Array, denominator: Array, channels: Sequence[Array]) -> list[Array]:
+    """Filter blocks of samples by matrix products; what a block leaves is carried to the next."""
+    (signals, samples), size = channels[0].shape, len(denominator) - 1
+    blocks = -(-samples // _AT_ONCE)
+    own, entering, leaving, carried = _block_matrices(
+        numerators.tobytes(), denominator.tobytes(), len(channels)
+    )
+    given = []
+    for e in channels:
+        padded = np.zeros((signals, blocks * _AT_ONCE))
+        padded[:, :samples] = e
+        given.append(padded.reshape(-1, _AT_ONCE))
+    y = np.zeros((len(given), *given[0].shape))
+    left = np.zeros((len(given), len(given[0]), size))
+    for i, j in zip(*np.nonzero(numerators.any(axis=2)), strict=True):
+        y[i] += given[j] @ own[i, j]
+        left[i] += given[j] @ leaving[i, j]
+    rows = left.reshape(-1, blocks, size)
+    pushed = np.ascontiguousarray(rows.swapaxes(0, 1))
+    state = np.zeros_like(pushed)
+    for k in range(blocks - 1):
+        np.dot(state[k], carried, out=state[k + 1])
+        state[k + 1] += pushed[k]
+    y += (state.swapaxes(0, 1).reshape(-1, size) @ entering).reshape(y.shape)
+    return [one.reshape(signals, -1)[:, :samples] for one in y]
+
+
+@lru_cache(maxsize=64)
+def _block_matrices(
+    numerators: bytes, denominator: bytes, channels: int
+) -> tuple[Array, Array, Array, Array]:
+    """Return what acts on rows of a block's samples and on rows of the state that it begins with.
+
+    ``own`` (k, k, L, L) from samples to outputs, ``entering`` (n, L) from the state to outputs,
+    ``leaving`` (k, k, L, n) from samples to the state after the block, ``carried`` (n, n) from the
+    state to that state; of the transposed direct form.
+    """
+    a = np.frombuffer(denominator)
+    b = np.frombuffer(numerators).reshape(channels, channels, len(a))
+    size = len(a) - 1
+    step = np.eye(size, k=1)
+    step[:, 0] -= a[1:]
+    first = b[:, :, 1:] - b[:, :, :1] * a[1:]
+    entering, leaving = np.empty((size, _AT_ONCE)), np.empty((*b.shape[:2], _AT_ONCE, size))
+    power = np.eye(size)
+    for k in range(_AT_ONCE):
+        entering[:, k] = power[0]
+        leaving[:, :, _AT_ONCE - 1 - k] = first @ power.T
+        power = step @ power
+    # of an impulse, by how many samples it is ago
+    response = np.concatenate([b[:, :, :1], first @ entering[:, :-1]], axis=2)
+    ago = np.arange(_AT_ONCE) - np.arange(_AT_ONCE)[:, None]
+    own = np.where(ago >= 0, response[:, :, np.maximum(ago, 0)], 0.0)
+    return own, entering, leaving, power.T.copy()
 
 
 def _stepped(a: Array, b: Array, out: Array) -> None:

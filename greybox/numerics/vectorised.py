@@ -56,6 +56,11 @@ _BINARY: dict[int, Callable[..., Any]] = {
     ca.OP_IF_ELSE_ZERO: lambda a, b: np.where(a != 0, b, 0.0),
 }
 
+# what it fills, by what, from what, and what is used by it for the last time
+_Call = tuple[int, Callable[..., Any], tuple[int, ...], tuple[int, ...]]
+# choices of expressions that are kept: those of a fit come again at each of its steps
+_PARTS = 64
+
 
 class Vectorised:
     """An SX function as a program of array operations.
@@ -107,7 +112,8 @@ class Vectorised:
         last = {i: target for target, _, sources in calls for i in sources}
         shown = {source for _, source in self._outputs}
         # with what a call is the last to use: its memory is warm, and given to the next
-        self._calls = [
+        self._parts: dict[tuple[int, ...], tuple[list[tuple[int, int]], list[_Call]]] = {}
+        self._calls: list[_Call] = [
             (*call, tuple(i for i in set(call[2]) if last[i] == call[0] and i not in shown))
             for call in calls
         ]
@@ -132,6 +138,20 @@ class Vectorised:
                 work[target] = call(*[work[i] for i in sources])
         return work
 
+    def _part(self, wanted: tuple[int, ...]) -> tuple[list[tuple[int, int]], list[_Call]]:
+        """Return the outputs that are wanted, and the calls that they need."""
+        if wanted not in self._parts:
+            if len(self._parts) == _PARTS:
+                del self._parts[next(iter(self._parts))]
+            place = {i: row for row, i in enumerate(wanted)}
+            outputs = [(place[i], source) for i, source in self._outputs if i in place]
+            needed = {source for _, source in outputs}
+            for target, _, sources, _ in reversed(self._calls):
+                if target in needed:
+                    needed.update(sources)
+            self._parts[wanted] = outputs, [call for call in self._calls if call[0] in needed]
+        return self._parts[wanted]
+
     def __call__(
         self,
         arrays: Sequence[Array | float],
@@ -154,13 +174,7 @@ class Vectorised:
         """
         outputs, calls = self._outputs, self._calls
         if wanted is not None:
-            place = {i: row for row, i in enumerate(wanted)}
-            outputs = [(place[i], source) for i, source in outputs if i in place]
-            needed = {source for _, source in outputs}
-            for target, _, sources, _ in reversed(calls):
-                if target in needed:
-                    needed.update(sources)
-            calls = [call for call in calls if call[0] in needed]
+            outputs, calls = self._part(tuple(wanted))
         work: dict[int, Any] = dict(self._constants if prepared is None else prepared)
         for k, i in self._inputs:
             work.setdefault(k, arrays[i])

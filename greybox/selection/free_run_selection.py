@@ -267,8 +267,8 @@ class FreeRunSelection:
         normal, right = np.zeros((len(known), len(known))), np.zeros(len(known))
         with np.errstate(over="ignore", invalid="ignore"):
             for i, noise in enumerate(self._noise(weighted)):
-                # contiguous, and one output at a time: the rows of all are large
-                own = np.ascontiguousarray(rows[:, i])
+                # one output at a time: the rows of all are large
+                own = rows[:, i]
                 normal += (own.T @ own) / (noise * runs.sigma[i] ** 2)
                 right += (own.T @ r[:, i]) / (noise * runs.sigma[i])
         hessian, gradient = np.zeros((len(p), len(p))), np.zeros(len(p))

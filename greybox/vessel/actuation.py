@@ -9,9 +9,12 @@ x[k] − d[k]|d[k]|/(2ρTs).
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import accumulate
+from functools import lru_cache
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +22,9 @@ from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Actuation, LagHeld, Vessel
 
 Array = NDArray[np.float64]
+
+# samples of a limited signal that are one function: less is spent between them
+_UNROLLED = 25
 
 __all__ = ["Actuation", "actuated_force", "delayed", "lagged", "limited", "with_actuators_of"]
 
@@ -130,14 +136,37 @@ def limited(value: Array, most: float) -> Array:
     It is at rest on the first value.
     """
     value = np.asarray(value, float)
-
-    def follow(now: float, wanted: float) -> float:
-        return now + min(max(wanted - now, -most), most)
-
-    rows = [list(accumulate(row, follow)) for row in value.reshape(-1, value.shape[-1]).tolist()]
+    samples = value.shape[-1]
+    blocks = -(-samples // _UNROLLED)
+    buffer, follow = _following(blocks).buffer()
+    take: Callable[..., None] = buffer.set_arg
+    give: Callable[..., None] = buffer.set_res
+    # the last block is filled with what follows nothing any more
+    wanted, end = np.zeros((2, blocks * _UNROLLED))
+    rates, last, rows = np.full(blocks, float(most)), np.empty(blocks), []
+    for row in value.reshape(-1, samples):
+        wanted[:samples] = row
+        first = row[:1].copy()
+        for i, array in enumerate((first, wanted, rates)):
+            take(i, memoryview(array))
+        for i, array in enumerate((last, end)):
+            give(i, memoryview(array))
+        follow()
+        rows.append(end[:samples].copy())
     end = np.array(rows).reshape(value.shape)
     way = np.diff(end, axis=-1, prepend=end[..., :1])
     return np.asarray(end - way * np.abs(way) / (2 * most))
+
+
+@lru_cache(maxsize=32)
+def _following(blocks: int) -> ca.Function:
+    """Return ``(x, wanted, most) -> last of each block, x of each sample`` of a limited signal."""
+    first, most, wanted = ca.SX.sym("x"), ca.SX.sym("most"), ca.SX.sym("wanted", _UNROLLED)
+    found = [first]
+    for k in range(_UNROLLED):
+        found.append(found[-1] + ca.fmin(ca.fmax(wanted[k] - found[-1], -most), most))
+    block = ca.Function("block", [first, wanted, most], [found[-1], ca.vertcat(*found[1:])])
+    return block.mapaccum("follow", blocks, [0], [0], {"base": max(2, math.isqrt(blocks))})
 
 
 def decay(samples: float) -> float:

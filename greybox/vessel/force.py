@@ -27,6 +27,7 @@ incidence the inflow angle from v and r adds to terms that hulls have anyway.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import casadi as ca
@@ -54,7 +55,9 @@ def force_inputs(vessel: Vessel) -> tuple[str, ...]:
     return tuple(names)
 
 
-def force_expressions(vessel: Vessel, commands: ca.SX) -> dict[str, ca.SX]:
+def force_expressions(
+    vessel: Vessel, commands: ca.SX, numbers: ca.SX | None = None
+) -> dict[str, ca.SX]:
     """Return each generalised input as an expression of the commands (3.46).
 
     Parameters
@@ -62,6 +65,9 @@ def force_expressions(vessel: Vessel, commands: ca.SX) -> dict[str, ca.SX]:
     vessel : Vessel
     commands : SX
         (nc,) in the order of `Vessel.commands`: speeds in the unit of the log, angles [rad].
+    numbers : SX, optional
+        (4, thrusters) gains, angle offsets, and the shares of a linear law that go with n and
+        with n|n|, in the place of those of the vessel.
     """
     column = {name: commands[i] for i, name in enumerate(vessel.commands)}
     total = {n: ca.SX(0) for n in force_inputs(vessel)}
@@ -70,14 +76,20 @@ def force_expressions(vessel: Vessel, commands: ca.SX) -> dict[str, ca.SX]:
         if name in total:
             total[name] = total[name] + value
 
-    for t in vessel.thrusters:
-        thrust = t.thrust.force(column[t.speed])
-        if t.gain != 1:
+    for k, t in enumerate(vessel.thrusters):
+        speed = column[t.speed]
+        thrust, offset = t.thrust.force(speed), ca.SX(t.angle_offset)
+        if numbers is not None:
+            gain, offset, straight, squared = ca.vertsplit(numbers[:, k])
+            if t.thrust.kind == "linear":
+                thrust = straight * speed + squared * speed * ca.fabs(speed)
+            thrust = gain * thrust
+        elif t.gain != 1:
             thrust = t.gain * thrust
         c: ca.SX | float
         s: ca.SX | float
         if isinstance(t.angle, str):
-            angle = column[t.angle] + t.angle_offset
+            angle = column[t.angle] + offset
             c, s = ca.cos(angle), ca.sin(angle)
         else:  # rounded, so that a tunnel thruster has exactly no force along the ship
             c, s = round(float(np.cos(t.angle)), 15), round(float(np.sin(t.angle)), 15)
@@ -86,7 +98,7 @@ def force_expressions(vessel: Vessel, commands: ca.SX) -> dict[str, ca.SX]:
         add("tauy", across)
         add("taun", t.x * across - t.y * along)
         if t.rudder is not None:
-            delta = column[t.rudder] + t.angle_offset
+            delta = column[t.rudder] + offset
             race = ca.fmax(thrust, 0)
             add("race", race * ca.sin(delta) * ca.cos(delta))
             add("rudder", ca.sin(delta) * ca.cos(delta))
@@ -109,10 +121,15 @@ def generalised_force(vessel: Vessel, commands: dict[str, Array]) -> dict[str, A
     dict of str to ndarray
         Each input of `force_inputs`, of that shape.
     """
-    program = _compiled(vessel.thrusters)
+    # numbers are given to the program, since an estimation changes them at every step
+    plain = tuple(
+        replace(t, gain=1.0, angle_offset=0.0, thrust=t.thrust.plain) for t in vessel.thrusters
+    )
+    program = _compiled(plain)
     arrays = [np.asarray(commands[c], float) for c in vessel.commands]
+    numbers = [n for t in vessel.thrusters for n in (t.gain, t.angle_offset, *t.thrust.shares)]
     names = force_inputs(vessel)
-    out = program(arrays, np.empty((len(names), *arrays[0].shape)))
+    out = program([*arrays, *numbers], np.empty((len(names), *arrays[0].shape)))
     return dict(zip(names, out, strict=True))
 
 
@@ -165,5 +182,6 @@ def _thrusts(thrusters: tuple[Thruster, ...]) -> Vectorised:
 def _compiled(thrusters: tuple[Thruster, ...]) -> Vectorised:
     vessel = Vessel("", 1.0, thrusters)
     commands = ca.SX.sym("commands", len(vessel.commands))
-    expressions = list(force_expressions(vessel, commands).values())
-    return Vectorised(expressions, ca.vertsplit(commands))
+    numbers = ca.SX.sym("numbers", 4, len(thrusters))
+    expressions = list(force_expressions(vessel, commands, numbers).values())
+    return Vectorised(expressions, [*ca.vertsplit(commands), *ca.vertsplit(ca.vec(numbers))])

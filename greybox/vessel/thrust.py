@@ -68,6 +68,16 @@ class ThrustLaw:
         """Unit of the force: N for a table, else that of the speed itself."""
         return {"linear": "n", "quadratic": "n²", "table": "N"}[self.kind]
 
+    @property
+    def shares(self) -> tuple[float, float]:
+        """What of a linear law goes with n, and what with n|n|."""
+        return 1 - self.quadratic_share, self.quadratic_share / self.reference
+
+    @property
+    def plain(self) -> ThrustLaw:
+        """The law without the shares."""
+        return ThrustLaw() if self.kind == "linear" else self
+
     def force(self, speed: ca.SX) -> ca.SX:
         """Return the force as an expression of the speed.
 
@@ -75,8 +85,8 @@ class ThrustLaw:
         formula that can be differentiated and designed with.
         """
         if self.kind == "linear":
-            s = self.quadratic_share
-            return (1 - s) * speed + s / self.reference * speed * ca.fabs(speed) if s else speed
+            straight, squared = self.shares
+            return straight * speed + squared * speed * ca.fabs(speed) if squared else speed
         if self.kind == "quadratic":
             return speed * ca.fabs(speed)
         slopes = [

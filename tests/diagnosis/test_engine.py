@@ -349,8 +349,9 @@ def test_every_cause_says_what_it_is(log: TrialLog) -> None:
 def test_sensitivities_of_nothing_are_those_of_the_start(log: TrialLog) -> None:
     simulator = VaryingSimulator(StepModel(WIDE), len(log))
     drivers = np.column_stack([log.forces(WIDE.inputs), log["psi"], np.zeros((len(log), 4))])
-    x = simulator(np.array([1.5, 0.5, 0.0]), drivers, _theta(WIDE))
-    linear = simulator.linearise(x, NOWHERE)
+    theta = _theta(WIDE)
+    x = simulator(np.array([1.5, 0.5, 0.0]), drivers, theta)
+    linear = simulator.linearise(x, drivers, theta, NOWHERE)
     found = sensitivities(linear)
     np.testing.assert_allclose(found[0], np.eye(3))
     np.testing.assert_allclose(found[1], linear.a[0])

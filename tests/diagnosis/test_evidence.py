@@ -119,8 +119,8 @@ def test_a_run_whose_squares_leave_every_number_ends_the_fit(
     changed: TrialLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, _, fit = fitted(changed, MOMENT)
-    slopes = problem.slopes(fit.point)
-    monkeypatch.setattr(Problem, "slopes", lambda *_: [1e200 * s for s in slopes])
+    slopes = problem.own_slopes(fit.point)
+    monkeypatch.setattr(Problem, "own_slopes", lambda *_: [(1e200 * s, at) for s, at in slopes])
     found = Problem(problem.runs).fit(fit.point, fit.noise)
     assert not found.converged
     np.testing.assert_array_equal(found.point.vector(), fit.point.vector())

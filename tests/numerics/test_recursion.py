@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
-from greybox.numerics.recursion import propagate
+from greybox.numerics.recursion import filtered, propagate
 
 
 def looped(a, b, start):
@@ -57,3 +58,26 @@ def test_beyond_the_numbers_it_is_infinite(columns):
     assert np.isfinite(found[:1000]).all()
     assert np.isposinf(found[1100:]).all()
     assert not np.isnan(found).any()
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+@pytest.mark.parametrize("samples", [20, 64, 333])
+def test_a_filter_by_blocks_equals_sample_by_sample(channels, samples):
+    rng = np.random.default_rng(3)
+    denominator = np.poly([0.995, 0.98, 0.3])
+    numerators = rng.standard_normal((channels, channels, 4))
+    numerators[0, -1] = 0.0 if channels == 2 else numerators[0, -1]
+    given = rng.standard_normal((channels, 7, samples))
+    expected = [
+        sum(lfilter(b, denominator, e) for b, e in zip(row, given, strict=True))
+        for row in numerators
+    ]
+    found = filtered(numerators, denominator, list(given))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_filter_keeps_what_was_before_a_number_out_of_range():
+    given = np.ones((5, 100))
+    given[:, 90] = np.inf
+    (found,) = filtered(np.array([[[1.0, 0.5]]]), np.array([1.0, -0.9]), [given])
+    np.testing.assert_allclose(found[:, :90], lfilter([1.0, 0.5], [1.0, -0.9], given[:, :90]))

@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 
 # samples whose derivatives are computed at once: a long log needs no more memory than these
 _BLOCK = 8192
+# and that are turned from rows to columns at once: what is read stays in a processor's memory
+_NEAR = 128
 
 
 @lru_cache(maxsize=32)
@@ -85,6 +87,14 @@ def _samples(x: Array) -> Array:
     return np.ascontiguousarray(x.reshape(-1, x.shape[2]).T)
 
 
+def _by_sample(rows: Array) -> Array:
+    """Return rows (n, N) as columns (N, n), so few samples at once that they stay near."""
+    out = np.empty(rows.shape[::-1])
+    for first in range(0, len(out), _NEAR):
+        out[first : first + _NEAR] = rows[:, first : first + _NEAR].T
+    return out
+
+
 class _Evaluator:
     """Evaluates functions on NumPy arrays, in memory that each is given once."""
 
@@ -125,15 +135,19 @@ class _Runs:
         self._read = np.ascontiguousarray(read, float)
         self._evaluate = _Evaluator()
         self._blocks: dict[bool, list[tuple[slice, Array, dict[int, Any]]]] = {}
+        # those of the module are found by the hash of a model, which takes longer
+        self._along: ca.Function | None = None
+        self._tables: dict[bool, _Table] = {}
 
     def __call__(
         self, carried: Sequence[Array], constant: Sequence[Array]
     ) -> tuple[list[Array], list[Array]]:
         """Return what is carried after each step, and what is found, each (M, m, ·)."""
-        of = self._build(self._model)
-        function = _along_runs(self._build, self._model, self.steps, self.runs)
-        out = [np.empty((self.runs, self.steps, x.numel())) for x in (*of.next, *of.results)]
-        self._evaluate(function, (*carried, self._read, *constant), tuple(out))
+        if self._along is None:
+            self._along = _along_runs(self._build, self._model, self.steps, self.runs)
+        shapes = map(self._along.size1_out, range(self._along.n_out()))
+        out = [np.empty((self.runs, self.steps, size)) for size in shapes]
+        self._evaluate(self._along, (*carried, self._read, *constant), tuple(out))
         return out[: len(carried)], out[len(carried) :]
 
     def _prepared(
@@ -178,7 +192,9 @@ class _Runs:
             Of what is found first, (M, m, ny, q + nz), and of the states after the last
             step, (M, nz, q + nz).
         """
-        table = _table(self._build, self._model, starts)
+        if starts not in self._tables:
+            self._tables[starts] = _table(self._build, self._model, starts)
+        table = self._tables[starts]
         (rows, columns), nz = table.shape, table.states
         wanted: list[int] | None = None
         if only is not None:
@@ -200,10 +216,10 @@ class _Runs:
             slope[:, :, columns - 2 * nz :] = np.eye(nz)
         with np.errstate(all="ignore"):
             for block, read, known in self._prepared(table, states.shape[2], starts):
-                matrix = np.empty((read.shape[1], rows * columns))
                 arguments = [*_samples(states[:, block]), *read, *fixed]
-                table.program(arguments, matrix.T, known, wanted)
-                by = matrix.reshape(self.runs, -1, rows, columns)
+                found_at = np.empty((rows * columns, read.shape[1]))
+                table.program(arguments, found_at, known, wanted)
+                by = _by_sample(found_at).reshape(self.runs, -1, rows, columns)
                 slopes = propagate(by[:, :, :nz, :nz], by[:, :, :nz, nz:], slope)
                 slope = slopes[:, -1]
                 if table.same:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.parallel import map_forked
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion
 from greybox.trial.checks.sensor_offsets.evidence import (
@@ -97,9 +98,7 @@ def _campaigns(
     logs: Sequence[Tied], ties: Sequence[KinematicModel], vessel: Vessel
 ) -> list[Campaign]:
     prior, material = expected(vessel), least(vessel)
-    first = []
-    for tie in ties:
-        first.append(expand(tie, search(tie, coarse_tie(tie), prior)))
+    first = map_forked(lambda tie: expand(tie, search(tie, coarse_tie(tie), prior)), ties)
     pooled, splits = pool(first, prior, material)
     evidence: list[Evidence] = list(first)
     for campaign in pooled:
