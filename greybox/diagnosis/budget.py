@@ -35,6 +35,8 @@ SENSOR, MOTION, SLOW, WAVES, REST = (
     "sensor noise", "motion and commands", "slow force", "waves", "not split",
 )  # fmt: skip
 _DRAWS = 1000
+# takes a cause, or terms, out of a point of the extended model
+Drop = Callable[[Problem, Point], Point]
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def nearest(
 def errors_without(
     final: Sequence[Pair],
     before: Fit,
-    drop: Callable[[Problem, Point], Point],
+    drop: Drop,
     first: Callable[[Sequence[TrialLog]], Mapping[str, float]],
 ) -> Array:
     """Return the held-out errors that the model without causes would have without one of them.
@@ -193,7 +195,7 @@ def error_budget(
     base: Sequence[Pair],
     final: Sequence[Pair],
     causes: Sequence[SwitchedOff],
-    plain: Sequence[Pair],
+    terms: Array | None,
     waves: Waves | None,
     seed: int,
 ) -> tuple[BudgetPart, ...]:
@@ -205,8 +207,9 @@ def error_budget(
         The model without causes as `nearest` returns it, and with those that stand, on what is
         held out.
     causes : sequence of SwitchedOff
-    plain : sequence of Pair
-        The extended model without the terms that it has beside its causes, fitted anew.
+    terms : ndarray or None
+        (N, nx), as `errors_without`, without the extended model's terms that stand for no cause;
+        None where it has none, empty where no run without them stays bounded.
     waves : Waves or None
         A line in what the causes leave.
     seed : int
@@ -236,29 +239,33 @@ def error_budget(
         noise.append((_noise_of(pair, left), sum(map(len, left))))
     rest = np.concatenate(parts)[:, : len(names)]
     left_over = {MOTION: e1**2 - rest**2}
-    before = {c.id: e0**2 - c.errors**2 for c in causes if len(c.errors)} | left_over
-    if not any(p.held_fit.escaped for p in plain):
-        before[MOTION] = np.concatenate([_states(p.held, p.held_fit) for p in plain]) ** 2 - rest**2
+    without = {c.id: c.errors for c in causes if len(c.errors)}
+    before = {name: e0**2 - errors**2 for name, errors in without.items()} | left_over
+    if terms is not None and len(terms):
+        without[MOTION] = terms
+        before[MOTION] = before[MOTION] + e0**2 - terms**2
     moments = _moments(noise, problem, names, waves, rest)
     rng = np.random.default_rng([seed, 11])
     starts, length = blocks(len(e0), problem.sample_time, _DRAWS, rng)
-    wide = {c.id: 1 + c.relative * rng.standard_normal(_DRAWS) for c in causes}
+    wide = {c.id: 1 + c.relative * rng.standard_normal((_DRAWS, 1)) for c in causes}
     whole, drawn_whole = (e0**2).sum(axis=0), _drawn(e0**2, starts, length)
     left = np.maximum((e1**2).sum(axis=0) - len(e0) * moments[SENSOR], 0.0)
     # the ship without the cause is known as well as the extended model follows it
     unsure = {
-        c.id: 2 * np.sqrt((c.errors**2).sum(axis=0) * left) / whole
+        name: 2
+        * np.sqrt((errors**2).sum(axis=0) * left)
+        / whole
         * np.cos(rng.uniform(0, 2 * np.pi, (_DRAWS, len(names))))
-        for c in causes if len(c.errors)
-    }  # fmt: skip
+        for name, errors in without.items()
+    }
     length_drawn = starts.shape[1] * length
 
     def shares(parts: dict[str, Array], of: Array) -> tuple[dict[str, Array], dict[str, Array]]:
         """Return the shares (nx,) and their draws (draws, nx) of parts of a squared error."""
         point = {name: part.sum(axis=0) / whole for name, part in parts.items()}
         draws = {name: _drawn(part, starts, length) / drawn_whole for name, part in parts.items()}
-        for name in set(parts) & set(wide):
-            draws[name] = draws[name] * wide[name][:, None] + unsure[name]
+        for name in set(parts) & set(without):
+            draws[name] = draws[name] * wide.get(name, 1.0) + unsure[name]
         for name, moment in moments.items():
             point[name] = len(e0) * moment / whole
             draws[name] = length_drawn * moment / drawn_whole

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.budget import SwitchedOff, error_budget, errors_without, nearest
+from greybox.diagnosis.budget import Drop, SwitchedOff, error_budget, errors_without, nearest
 from greybox.diagnosis.causes import Cause
 from greybox.diagnosis.evidence.confusion import rivals
 from greybox.diagnosis.evidence.held_out import Pair
@@ -18,6 +19,7 @@ from greybox.diagnosis.evidence.standing import standing
 from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.gain import gains, run_on
+from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.null_model import FOLDS, DiagnosisProblem
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.quantities import quantities_of
@@ -165,36 +167,27 @@ class DiagnosisBuilder:
         if any(p.fit.escaped or p.held_fit.escaped for p in pairs):
             return ()
 
-        def without(cause: Candidate) -> Array:
-            def drop(problem: Problem, point: Point) -> Point:
-                return problem.drop(point, cause.hypothesis)
-
-            return errors_without(pairs, found.before, drop, self.case.first)
-
+        drops: list[Drop] = [partial(_leave_out, c.hypothesis) for c in named]
+        nameless = self._nameless(final)
+        if nameless:
+            drops.append(partial(_at_zero, nameless))
+        without = map_forked(
+            lambda drop: errors_without(pairs, found.before, drop, self.case.first), drops
+        )
         causes = map(
             SwitchedOff,
             [c.hypothesis.id for c in named],
-            map_forked(without, named),
+            without,
             [_relative(quantities_of(problem, c, final)) for c in named],
         )
-        nameless = self._without_nameless(final)
-        plain = pairs if nameless is None else held_out(final.integrator).pairs(nameless)
-        return error_budget(base, pairs, list(causes), plain, waves, self.seed)
+        terms = without[-1] if nameless else None
+        return error_budget(base, pairs, list(causes), terms, waves, self.seed)
 
-    def _without_nameless(self, final: Fit) -> Fit | None:
-        """Return the extended model without terms that stand for no cause; None if it has none."""
+    def _nameless(self, final: Fit) -> frozenset[int]:
+        """Return the places of terms of the extended model that stand for no cause."""
         problem = self.case.problem(final.integrator)
         own = {i for h in final.point.hypotheses for i in problem.numbers_at(h)}
-        nameless = set(final.point.places) - set(self.found.base.point.places) - own
-        if not nameless:
-            return None
-        base = final.point.base
-        for i in nameless:
-            base = base.with_value(i, 0.0)
-        places = tuple(i for i in final.point.places if i not in nameless)
-        point = replace(final.point, base=base, places=places)
-        fit = replace(problem.fit(point, final.noise), integrator=final.integrator)
-        return None if fit.escaped else fit
+        return frozenset({*final.point.places} - {*self.found.base.point.places} - own)
 
     def record(self, causes: Sequence[Candidate]) -> dict[str, Any]:
         """Return what a model file tells beside."""
@@ -320,6 +313,17 @@ class DiagnosisBuilder:
         for change in after.changes:
             out.append(f"the extended model tells the log's own clock: {change.sentence}.")
         return out
+
+
+def _leave_out(hypothesis: Hypothesis, problem: Problem, point: Point) -> Point:
+    return problem.drop(point, hypothesis)
+
+
+def _at_zero(terms: frozenset[int], problem: Problem, point: Point) -> Point:
+    base = point.base
+    for i in terms:
+        base = base.with_value(i, 0.0)
+    return replace(point, base=base, places=tuple(i for i in point.places if i not in terms))
 
 
 def _relative(quantities: Mapping[str, Quantity]) -> float:

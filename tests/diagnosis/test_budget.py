@@ -49,7 +49,7 @@ def test_a_cause_takes_what_switching_it_off_does(pair: Pair) -> None:
     one, other = two_series(pair)
     base = beside(pair, one, other)
     causes = [off(pair, other), replace(off(pair, one), id="wind")]
-    budget = {p.part: p for p in error_budget([base], [pair], causes, [pair], None, 0)}
+    budget = {p.part: p for p in error_budget([base], [pair], causes, None, None, 0)}
     e0 = base.held_fit.errors[0]
     for i, state in enumerate("uvr"):
         whole = (e0[:, i] ** 2).sum()
@@ -68,26 +68,29 @@ def test_a_cause_takes_what_switching_it_off_does(pair: Pair) -> None:
 def test_a_cause_without_which_no_run_is_bounded_is_not_split(pair: Pair) -> None:
     one, _ = two_series(pair)
     lost = SwitchedOff("current", np.zeros((0, 3)), 0.1)
-    budget = {p.part: p for p in error_budget([beside(pair, one)], [pair], [lost], [pair], None, 0)}
+    budget = {p.part: p for p in error_budget([beside(pair, one)], [pair], [lost], None, None, 0)}
     assert "current" not in budget
     assert budget[REST].share["r"] > 0.8
 
 
 def test_terms_without_a_name_belong_to_motion_and_commands(pair: Pair) -> None:
     one, other = two_series(pair)
-    base, plain = beside(pair, one, other), beside(pair, other)
-    parts = error_budget([base], [pair], [off(pair, other)], [plain], None, 0)
-    share = {p.part: p.share for p in parts}[MOTION]
-    e0, e1 = (p.held_fit.errors[0] for p in (base, pair))
-    took = ((e1 + other) ** 2 - e1**2).sum(axis=0) / (e0**2).sum(axis=0)
+    base = beside(pair, one, other)
+    parts = error_budget([base], [pair], [], off(pair, other).errors, None, 0)
+    found = next(p for p in parts if p.part == MOTION)
+    e0, without = (p.held_fit.errors[0] for p in (base, beside(pair, other)))
+    took = 1 - (without**2).sum(axis=0) / (e0**2).sum(axis=0)
     for i, state in enumerate("uvr"):
-        assert share[state] == pytest.approx(took[i], abs=0.02)
+        assert found.share[state] == pytest.approx(took[i], abs=0.02)
+        low, high = found.ci[state]
+        assert low <= found.share[state] <= high
+        assert abs(found.after[state]) < 0.02
 
 
 def test_the_noise_of_the_sensors_has_its_own_share(pair: Pair) -> None:
     one, _ = two_series(pair)
     base = beside(pair, one)
-    budget = {p.part: p for p in error_budget([base], [pair], [off(pair)], [pair], None, 0)}
+    budget = {p.part: p for p in error_budget([base], [pair], [off(pair)], None, None, 0)}
     e0 = base.held_fit.errors[0]
     true = 2e-4 * len(e0) / (e0[:, 2] ** 2).sum()
     assert budget[SENSOR].share["r"] == pytest.approx(true, rel=0.15)
@@ -101,7 +104,7 @@ def test_an_uncertain_cause_has_a_wider_interval(pair: Pair) -> None:
 
     def width(relative: float) -> float:
         cause = off(pair, relative=relative)
-        parts = error_budget([base], [pair], [cause], [pair], None, 0)
+        parts = error_budget([base], [pair], [cause], None, None, 0)
         low, high = next(p for p in parts if p.part == "current").ci["u"]
         return high - low
 
@@ -110,7 +113,7 @@ def test_an_uncertain_cause_has_a_wider_interval(pair: Pair) -> None:
 
 def test_a_run_that_leaves_every_bound_has_no_budget(pair: Pair) -> None:
     escaped = replace(pair, held_fit=replace(pair.held_fit, cost=np.inf))
-    assert error_budget([escaped], [pair], [], [pair], None, 0) == ()
+    assert error_budget([escaped], [pair], [], None, None, 0) == ()
 
 
 def test_nothing_changes_where_nothing_is_switched_off(pair: Pair) -> None:
