@@ -84,6 +84,13 @@ class _Normal:
             return bool(away @ self.matrix @ away < _NEAR)
 
 
+def _moved_little(away: Array, noise: Noise, slopes: Sequence[_Own]) -> bool:
+    """Whether derivatives do for a vector so far away, too: `_Normal.near` without a matrix."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = [np.matmul(away[where], own.transpose(1, 2, 0)).T for own, where in slopes]
+        return bool(sum((noise.whiten(m[:, :, None]) ** 2).sum() for m in moved) < _NEAR)
+
+
 class Problem:
     """Logs, ready to be explained.
 
@@ -291,9 +298,9 @@ class Problem:
         """Return the normal equations at a point, by derivatives made at it or near to it."""
         known = self._known
         if known is not None and known[0].alike(point):
-            normal = _Normal.of(known[0].vector(), noise, known[1])
-            if normal.near(vector):
-                return normal
+            at = known[0].vector()
+            if _moved_little(vector - at, noise, known[1]):
+                return _Normal.of(at, noise, known[1])
         self._known = (point, self.own_slopes(point))
         return _Normal.of(vector, noise, self._known[1])
 

@@ -226,14 +226,6 @@ def _colour(group: tuple[int, ...], rest: tuple[Array, float, float], x: Array) 
     )
 
 
-def _delays(series: Array, count: int) -> Array:
-    """Return a series (N,) as of 0 to count − 1 samples earlier, zero before it began."""
-    out = np.zeros((len(series), count))
-    for j in range(count):
-        out[j:, j] = series[: len(series) - j]
-    return out
-
-
 class Likelihood:
     """−2 log L of the errors of a group, its gradient and Fisher information.
 
@@ -246,55 +238,78 @@ class Likelihood:
     """
 
     def __init__(self, parts: Sequence[Array], rest: tuple[Array, float, float]) -> None:
-        self.parts, self.rest, self.k = parts, rest, parts[0].shape[1]
+        self.rest, self.k = rest, parts[0].shape[1]
         self.samples = sum(map(len, parts))
-        self._last: tuple[Array, tuple[Array, Array, Array]] | None = None
+        # side by side, the ends together: a filter that rests passes zeros over
+        self._errors = np.zeros((self.k, len(parts), max(map(len, parts))))
+        for i, part in enumerate(parts):
+            self._errors[:, i, -len(part) :] = part.T
+        self._last: tuple[Array, _Filtered] | None = None
 
-    def _transfer(self, x: Array) -> tuple[Array, Array, Array]:
+    def _at(self, x: Array) -> _Filtered:
         # slopes are asked for where a value was found
         if self._last is None or not np.array_equal(self._last[0], x):
             found = _transfer(self.k, np.array(_filter(self.k)(x, *self.rest)[0])[:, 0])
-            self._last = (x, found)
+            numerators, denominator, logs = found
+            past = self._past(self._errors, denominator)
+            nu = numerators.reshape(self.k, -1) @ past.reshape(numerators[0].size, -1)
+            self._last = (x, _Filtered(denominator, logs, past, nu))
         return self._last[1]
+
+    def _past(self, series: Array, denominator: Array) -> Array:
+        """Return series (k, logs, N) by 1/A as of 0 to n samples earlier, (k, n+1, samples)."""
+        from scipy.signal import lfilter
+
+        given = series.reshape(self._errors.shape)
+        made = lfilter([1.0], denominator, given)
+        out = np.zeros((self.k, len(denominator), *made.shape[1:]))
+        for j in range(len(denominator)):
+            out[:, j, :, j:] = made[:, :, : made.shape[2] - j]
+        return out.reshape(self.k, len(denominator), -1)
 
     def value(self, x: Array) -> float:
         """Return −2 log L at x, and the price of a memory far from what is usual."""
-        numerators, denominator, logs = self._transfer(x)
-        cost = _PRIOR_WEIGHT * float(x[1] - _PRIOR) ** 2 + 2 * self.samples * float(logs.sum())
-        for part in self.parts:
-            cost += float((_innovations(numerators, denominator, part) ** 2).sum())
-        return cost
+        at = self._at(x)
+        price = _PRIOR_WEIGHT * float(x[1] - _PRIOR) ** 2
+        return price + 2 * self.samples * float(at.logs.sum()) + float((at.nu**2).sum())
 
     def slopes(self, x: Array) -> tuple[Array, Array]:
         """Return the gradient (q,) and the Fisher information (q, q) of −2 log L at x."""
-        from scipy.signal import lfilter
-
-        k = self.k
-        numerators, denominator, _ = self._transfer(x)
-        slope_n, slope_d, slope_l = _transfer(k, np.array(_filter(k, True)(x, *self.rest)))
-        order = len(denominator)
-        gradient, information = 2 * self.samples * slope_l.sum(axis=0), np.zeros((len(x), len(x)))
-        information += 2 * self.samples * slope_l.T @ slope_l
-        for part in self.parts:
-            past = [_delays(lfilter([1.0], denominator, e), order) for e in part.T]
-            for i in range(k):
-                nu = sum(past[j] @ numerators[i, j] for j in range(k))
-                own = _delays(lfilter([1.0], denominator, nu), order)
-                rows = sum(past[j] @ slope_n[i, j] for j in range(k)) - own @ slope_d
-                gradient += 2 * rows.T @ nu
-                information += 2 * rows.T @ rows
+        at = self._at(x)
+        slope_n, slope_d, slope_l = _transfer(
+            self.k, np.array(_filter(self.k, True)(x, *self.rest))
+        )
+        gradient = 2 * self.samples * slope_l.sum(axis=0)
+        information = 2 * self.samples * slope_l.T @ slope_l
+        past = at.past.reshape(-1, at.past.shape[2])
+        own = self._past(at.nu, at.denominator)
+        for i, nu in enumerate(at.nu):
+            rows = slope_n[i].reshape(len(past), -1).T @ past - slope_d.T @ own[i]
+            gradient += 2 * rows @ nu
+            information += 2 * rows @ rows.T
         gradient[1] += 2 * _PRIOR_WEIGHT * (x[1] - _PRIOR)
         information[1, 1] += 2 * _PRIOR_WEIGHT
         return gradient, information
 
 
-def _innovations(numerators: Array, denominator: Array, e: Array) -> Array:
-    from scipy.signal import lfilter
+@dataclass(frozen=True)
+class _Filtered:
+    """Errors passed through a filter.
 
-    if e.shape[1] == 1:
-        return np.asarray(lfilter(numerators[0, 0], denominator, e[:, 0]))
-    past = [_delays(lfilter([1.0], denominator, one), len(denominator)) for one in e.T]
-    return np.stack([sum(p @ n for p, n in zip(past, row, strict=True)) for row in numerators])
+    Parameters
+    ----------
+    denominator, logs : ndarray
+        (n+1,) A of the filter, and (k,) the logarithms of L's diagonal.
+    past : ndarray
+        (k, n+1, samples) errors by 1/A as of 0 to n samples earlier.
+    nu : ndarray
+        (k, samples) innovations.
+    """
+
+    denominator: Array
+    logs: Array
+    past: Array
+    nu: Array
 
 
 def fit_noise(
