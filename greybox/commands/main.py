@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -136,15 +137,10 @@ def _run(options: argparse.Namespace) -> None:
     if used := options.configuration:
         _log.info("configuration %s gives %s", used["file"], ", ".join(used["options"]))
     require_apart(options)
-    if hasattr(options, "cluster"):
-        from greybox.numerics.parallel import on_cluster
+    with ExitStack() as stack:
+        if hasattr(options, "cluster"):
+            from greybox.numerics.parallel import on_cluster
 
-        with on_cluster(options.cluster):
-            options.run(options)
-    else:
+            stack.enter_context(on_cluster(options.cluster))
         options.run(options)
     _log.info("done")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -17,7 +17,7 @@ from virtual import virtual_log, write_csv
 
 from greybox.commands.main import main
 
-SCRIPT = [sys.executable, "-m", "greybox.commands.main"]
+SCRIPT = [sys.executable, "-m", "greybox"]
 
 
 def run(*arguments):
