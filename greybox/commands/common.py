@@ -94,22 +94,25 @@ def read_logs(
     Returns
     -------
     tuple of (list of TrialLog, tuple of str)
-        The segments, and a sentence for each gap and for each file and segment that was left
-        out.
+        The segments, and a sentence for each column that holds another unit, frame or sign
+        than its name, for each gap, and for each file and segment that was left out.
     """
     from greybox.errors import LogError
+    from greybox.trial.checks.check import misnamed_columns
     from greybox.trial.convert.read import read_segments
     from greybox.trial.kinematics import decimate_segments
     from greybox.trial.log_files import find_logs, local_copy
     from greybox.trial.segments import find_log_gaps, join_segments
 
     logs: list[TrialLog] = []
+    misnamed: list[str] = []
     told: list[str] = []
     refused: LogError | None = None
     for file in find_logs(paths):
         try:
             with local_copy(file.path) as path:
                 segments = read_segments(path, vessel, states=states)
+                misnamed += misnamed_columns([path], vessel)
         except LogError as error:
             if not file.found:
                 raise
@@ -121,9 +124,9 @@ def read_logs(
     if refused is not None and not logs:
         raise refused
     if sample_time is None or not logs:
-        return logs, tuple(told)
+        return logs, (*misnamed, *told)
     logs, left_out = decimate_segments(logs, sample_time)
-    return logs, (*told, *left_out)
+    return logs, (*misnamed, *told, *left_out)
 
 
 # options that name files to read, and to write

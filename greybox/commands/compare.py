@@ -41,10 +41,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Read, run, report."""
+    from dataclasses import replace
     from pathlib import Path
 
     from greybox.files import check_targets, write_json
     from greybox.model.model import load_model
+    from greybox.trial.checks.check import misnamed_columns
     from greybox.trial.convert.read import read_log
     from greybox.trial.log_files import find_logs
     from greybox.validation.comparison import compare
@@ -68,6 +70,8 @@ def run(options: argparse.Namespace) -> None:
     comparison = compare(
         named, logs, heading=options.heading, bands=not options.no_bands, seed=options.seed
     )
+    misnamed = (n for m in models for n in misnamed_columns([f.path for f in files], m.vessel))
+    comparison = replace(comparison, notes=tuple(dict.fromkeys(misnamed)))
     record = provenance(options) | {
         "logs": [log.provenance.source + " " + log.provenance.sha256[:12] for log in logs[names[0]]]
     }

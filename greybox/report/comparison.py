@@ -108,6 +108,7 @@ def comparison_page(
         title="Measured against simulated",
         headline=headline(comparison),
         sentences=[
+            *comparison.notes,
             *[t.sentence for t in tests],
             *[
                 f"{name}: {d.sentence}"

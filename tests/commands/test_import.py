@@ -135,8 +135,8 @@ def test_angles_that_cannot_be_radians_are_told(tmp_path, capsys):
     given = ["import", tmp_path / "raw.csv", "--vessel", "thesis", "--out", tmp_path / "log.csv"]
     status, out, _ = run(capsys, *given)
     assert status == 0
-    assert "note: alpha1 reaches 45.84, which cannot be radians" in out
-    assert "multiply alpha1 by pi/180 (import --fix does)" in out
+    assert "note: alpha1 reaches 45.84, above the 12.6 rad that it can reach" in out
+    assert 'write alpha1 = { name = "alpha1", unit = "deg" } under [columns]' in out
     assert "columns not used: paint (map those that belong to the log in" in out
     status, out, _ = run(capsys, *given, "--fix", "--fix-not", "stuck")
     assert "note: alpha1 reaches" not in out
