@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import platform
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import file_digest
 from importlib.metadata import version
 from pathlib import Path
@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any
 from greybox.commands.terminal import complain, progress, say
 
 if TYPE_CHECKING:
+    from greybox.report.page import Page
     from greybox.trial.log import TrialLog
     from greybox.vessel.vessel import Vessel
 
 
 __all__ = [
-    "add_cluster", "add_logs", "add_seed", "complain", "count", "positive", "progress",
-    "provenance", "read_logs", "say",
+    "add_cluster", "add_logs", "add_outputs", "add_seed", "complain", "count", "positive",
+    "progress", "provenance", "publish", "read_logs", "say",
 ]  # fmt: skip
 
 # where a command computes changes no result
@@ -39,6 +40,44 @@ def add_logs(parser: argparse.ArgumentParser) -> None:
         "s3://bucket/folder",
     )
     parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
+
+
+def add_outputs(parser: argparse.ArgumentParser, result: str, page: str) -> None:
+    """Add --json and --report, with what they write in words."""
+    parser.add_argument("--json", metavar="F", help=f"write {result} as JSON; - is stdout")
+    parser.add_argument("--report", metavar="HTML", help=f"write a page with {page}")
+
+
+def publish(
+    options: argparse.Namespace,
+    result: Mapping[str, Any],
+    summary: str,
+    page: Callable[[], Page],
+    written: Sequence[str | None] = (),
+) -> None:
+    """Write a result where --json and --report ask for it, and show it on the terminal.
+
+    Parameters
+    ----------
+    result : mapping
+        For JSON.
+    summary : str
+        Shown unless the JSON goes to the terminal, with the files that were `written` before.
+    page : callable
+        Makes the page.
+    """
+    from greybox.files import write_json
+
+    if options.json:
+        write_json(result, options.json)
+    if options.report:
+        from greybox.report.page import write_page
+
+        write_page(page(), options.report)
+    if options.json != "-":
+        say(summary)
+        for path in filter(None, (*written, options.report)):
+            say(f"wrote {path}")
 
 
 def positive(text: str) -> float:

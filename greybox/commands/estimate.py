@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any, Literal
 from greybox.commands.common import (
     add_cluster,
     add_logs,
+    add_outputs,
     add_seed,
     positive,
     progress,
     provenance,
+    publish,
     read_logs,
-    say,
 )
 from greybox.estimation.registry import ESTIMATORS
 from greybox.model.predictor_kinds import PREDICTORS
@@ -25,6 +26,7 @@ from greybox.public import one_thread
 MEMORY = 4.0
 
 if TYPE_CHECKING:
+    from greybox.report.page import Page
     from greybox.selection.estimate_stream import StreamEstimate
     from greybox.selection.request import Request
     from greybox.selection.stretches import Drawn
@@ -50,8 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_logs(parser)
     parser.add_argument("--out", metavar="MODEL", help="write the model to this JSON file")
-    parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
-    parser.add_argument("--report", metavar="HTML", help="write a page with plots and all tests")
+    add_outputs(parser, "the result", "plots and all tests")
     add_seed(parser)
     add_cluster(parser)
     _add_model(parser)
@@ -325,7 +326,7 @@ def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
     from greybox.errors import UsageError
     from greybox.estimation.output_error import OutputErrorOptions
-    from greybox.files import check_targets, write_json
+    from greybox.files import check_targets
     from greybox.model.catalogue import get_structure, structure_for
     from greybox.model.model import load_model
     from greybox.report.physical import physical_summary
@@ -416,21 +417,14 @@ def run(options: argparse.Namespace) -> None:
     mass = options.mass if options.mass is not None else vessel.mass
     if options.out:
         model.save(options.out)
-    if options.json:
-        write_json(model.to_dict(), options.json)
-    if options.report:
+    summaries = [estimate.summary()]
+    summaries += [choice.summary()] if choice else []
+    summaries += [physical_summary(model, mass)] if mass is not None else []
+
+    def page() -> Page:
         from greybox.report.estimation import estimation_page
-        from greybox.report.page import write_page
         from greybox.selection.prediction import as_read
 
-        page = estimation_page(estimate, as_read(logs, estimate), made, choice=choice, mass=mass)
-        write_page(page, options.report)
-    if options.json != "-":
-        say(estimate.summary())
-        if choice:
-            say("\n" + choice.summary())
-        if mass is not None:
-            say("\n" + physical_summary(model, mass))
-        for path in (options.out, options.report):
-            if path:
-                say(f"\nwrote {path}")
+        return estimation_page(estimate, as_read(logs, estimate), made, choice=choice, mass=mass)
+
+    publish(options, model.to_dict(), "\n\n".join(summaries), page, [options.out])

@@ -3,8 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
-from greybox.commands.common import add_cluster, add_seed, progress, provenance, say
+from greybox.commands.common import (
+    add_cluster,
+    add_outputs,
+    add_seed,
+    progress,
+    provenance,
+    publish,
+)
+
+if TYPE_CHECKING:
+    from greybox.report.page import Page
 
 HELP = "estimate many ships of one class: what they share, which one differs, what changes in time"
 EXAMPLES = """examples:
@@ -20,11 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder with one folder a ship, each with a vessel file (*.toml) and logs (CSV, "
         "Parquet), in order of time by their dates or names",
     )  # fmt: skip
-    parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
     parser.add_argument(
         "--out", metavar="CSV", help="write a table with a row for each coefficient of each ship"
     )
-    parser.add_argument("--report", metavar="HTML", help="write a page with plots")
+    add_outputs(parser, "the result", "plots")
     add_cluster(parser)
     add_seed(parser)
 
@@ -47,7 +57,7 @@ def _require_outside(options: argparse.Namespace) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Estimate, pool, tell."""
-    from greybox.files import check_targets, sha256, write_json
+    from greybox.files import check_targets, sha256, write_text
     from greybox.fleet.fleet import estimate_fleet
     from greybox.fleet.ships import fleet_files
 
@@ -59,18 +69,12 @@ def run(options: argparse.Namespace) -> None:
     if options.out:
         import pandas as pd
 
-        from greybox.files import write_text
-
         write_text(pd.DataFrame(fleet.rows()).to_csv(index=False), options.out)
-    if options.json:
-        write_json(fleet.to_dict() | {"provenance": record}, options.json)
-    if options.report:
-        from greybox.report.fleet import fleet_page
-        from greybox.report.page import write_page
 
-        write_page(fleet_page(fleet, record), options.report)
-    if options.json != "-":
-        say(fleet.summary())
-        for path in (options.out, options.report):
-            if path:
-                say(f"\nwrote {path}")
+    def page() -> Page:
+        from greybox.report.fleet import fleet_page
+
+        return fleet_page(fleet, record)
+
+    told = fleet.to_dict() | {"provenance": record}
+    publish(options, told, fleet.summary(), page, [options.out])

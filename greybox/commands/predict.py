@@ -5,10 +5,20 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from greybox.commands.common import add_seed, count, positive, progress, provenance, read_logs, say
+from greybox.commands.common import (
+    add_outputs,
+    add_seed,
+    count,
+    positive,
+    progress,
+    provenance,
+    publish,
+    read_logs,
+)
 
 if TYPE_CHECKING:
     from greybox.prediction.result import ManoeuvrePrediction
+    from greybox.report.page import Page
     from greybox.trial.log import TrialLog
 
 HELP = "predict standard manoeuvres, with intervals and the IMO limits"
@@ -30,8 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("turning", "zigzag", "stopping", "crash"),
         help="stopping: with the thrust taken off; crash: with full astern",
     )
-    parser.add_argument("--json", metavar="F", help="write the quantities as JSON; - is stdout")
-    parser.add_argument("--report", metavar="HTML", help="write a page with tracks and histories")
+    add_outputs(parser, "the quantities", "tracks and histories")
     parser.add_argument(
         "--out",
         metavar="CSV",
@@ -123,7 +132,7 @@ def run(options: argparse.Namespace) -> None:
     import math
     from dataclasses import replace
 
-    from greybox.files import check_targets, write_json
+    from greybox.files import check_targets
     from greybox.model.model import load_model
     from greybox.prediction.predict import predict_manoeuvre
 
@@ -158,21 +167,14 @@ def run(options: argparse.Namespace) -> None:
     )
     made = replace(made, notes=(*told, *made.notes))
     record = provenance(options)
-    written = []
-    if options.out:
-        written += _write_runs(made, options.out)
-    if options.json:
-        write_json(made.to_dict() | {"provenance": record}, options.json)
-    if options.report:
-        from greybox.report.page import write_page
+    written = _write_runs(made, options.out) if options.out else []
+
+    def page() -> Page:
         from greybox.report.prediction import prediction_page
 
-        write_page(prediction_page(made, record), options.report)
-        written.append(options.report)
-    if options.json != "-":
-        say(made.summary())
-        for name in written:
-            say(f"wrote {name}")
+        return prediction_page(made, record)
+
+    publish(options, made.to_dict() | {"provenance": record}, made.summary(), page, written)
 
 
 def _angle(text: str) -> float | tuple[float, float]:
