@@ -212,8 +212,7 @@ def _sailed(trial: Trial) -> Step:
         "",
         (
             f"A virtual ship sails the plan and {len(trial.validation)} s of usual pulses, in "
-            f"continuous time, with noisy sensors. Something is wrong with it that its model "
-            f"does not know.",
+            f"continuous time, with noisy sensors. It has an effect that its model lacks.",
         ),
     )
 

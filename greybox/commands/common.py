@@ -103,7 +103,7 @@ count.__name__ = "whole number of at least 0"
 def add_seed(parser: argparse.ArgumentParser) -> None:
     """Add --seed."""
     parser.add_argument(
-        "--seed", type=count, default=0, metavar="N", help="seed of whatever is random (0)"
+        "--seed", type=count, default=0, metavar="N", help="seed of the random numbers (0)"
     )
 
 
@@ -112,7 +112,7 @@ def add_cluster(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--cluster",
         metavar="ADDRESS",
-        help="compute on the Dask cluster whose scheduler is there, such as tcp://host:8786; by "
+        help="compute on the Dask cluster of this scheduler, such as tcp://host:8786; by "
         "default that of GREYBOX_CLUSTER, or else this machine",
     )
 

@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     base.add_argument(
         "--model",
         metavar="MODEL",
-        help="model to diagnose as it is; by default (3.51) in still water and air, estimated on "
-        "the logs, and the terms that the data choose",
+        help="model to diagnose as it is; by default (3.51) in still water and air with the terms "
+        "that the data choose, estimated on the logs",
     )
     parser.add_argument(
         "--validate",
@@ -50,7 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="MODEL",
-        help="write the extended model; of causes that cannot be told apart, MODEL.<id>.json each",
+        help="write the extended model; where causes cannot be told apart, MODEL.<id>.json for "
+        "each",
     )
     base.add_argument(
         "--structure",
@@ -59,20 +60,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="structure to begin from without --model; its wind terms are left out (thesis)",
     )
     parser.add_argument(
-        "--causes", nargs="+", metavar="ID", help="look for these causes only (all that are known)"
+        "--causes",
+        nargs="+",
+        metavar="ID",
+        help="look for these causes only (by default all known ones)",
     )
     parser.add_argument(
         "--remainder",
         action="store_true",
-        help="add a smooth force without a name to the extended model, zero away from what the "
-        "logs show, where it makes held-out free runs better",
+        help="add a smooth generic force to the extended model where that improves held-out free "
+        "runs; it is zero outside the range of the logs",
     )
     parser.add_argument(
         "--sample-time",
         type=positive,
         metavar="S",
-        help="decimate the logs to this sample time; by default that of MODEL, or what suits the "
-        "ship's pace",
+        help="decimate the logs to this sample time; by default that of MODEL, or one that suits "
+        "the ship's speed",
     )
     add_seed(parser)
     add_cluster(parser)

@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_model(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("what is estimated, and how")
+    group = parser.add_argument_group("model and method")
     group.add_argument(
         "--method",
         choices=tuple(ESTIMATORS),
@@ -86,8 +86,8 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
         type=positive,
         default=EFFORT,
         metavar="SECONDS",
-        help="time for choosing what you leave open [s]; notes name what it did not suffice for, "
-        f"and the first estimate is always completed ({EFFORT:g})",
+        help="time limit for choosing what you leave open [s]; notes name what was not tried "
+        "within it, and the first estimate is always completed ({EFFORT:g})",
     )
     chosen = group.add_mutually_exclusive_group()
     chosen.add_argument(
@@ -105,8 +105,8 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
         "--covariance",
         choices=("cluster", "ma", "hac", "white", "bootstrap"),
         help="how standard errors are computed: by the spread between segments where that is "
-        "larger (default), for a moving average, for coloured residuals, for white ones, or by a "
-        "block bootstrap",
+        "larger (cluster, the default), for residuals that are a moving average (ma), coloured "
+        "(hac) or white, or by a block bootstrap",
     )
     group.add_argument(
         "--mass", type=positive, metavar="KG", help="mass [kg], for physical coefficients"
@@ -114,7 +114,7 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_data(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("which samples, and how they came about")
+    group = parser.add_argument_group("data")
     group.add_argument(
         "--sample-time",
         type=positive,
@@ -126,16 +126,16 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         type=positive,
         default=MEMORY,
         metavar="GIB",
-        help="logs whose estimate would take more memory than this [GiB] are read in passes, and "
-        f"tests rest on the stretches that tell most ({MEMORY:g})",
+        help="memory limit [GiB]; larger logs are read in passes, and the tests use their most "
+        "informative stretches ({MEMORY:g})",
     )
     group.add_argument(
         "--validate",
         nargs="+",
         default=[],
         metavar="LOG",
-        help="logs on which the prediction is judged and that take no part in the estimate; by "
-        "default the logs are left out in turn",
+        help="logs that the prediction is judged on and the estimate does not use; by default the "
+        "logs, or parts of them, are left out in turn",
     )
     group.add_argument(
         "--plan",
@@ -159,8 +159,8 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         "--loop",
         choices=("auto", "open", "closed"),
         default="auto",
-        help="whether a controller moved the thrusters; auto: by the vessel file's [closed_loop] "
-        "(auto)",
+        help="whether a controller moved the thrusters (auto: as [closed_loop] of the vessel file "
+        "says)",
     )
     group.add_argument(
         "--heading",
@@ -217,8 +217,8 @@ def _add_output_error(parser: argparse.ArgumentParser) -> None:
         "--weights",
         choices=("noise", "deviation"),
         default="noise",
-        help="unit of the errors: the outputs' noise, or for a model that misfits their standard "
-        "deviation (noise)",
+        help="scale of the errors: the noise of the outputs, or the standard deviation of the "
+        "errors, for a model that fits worse than that (noise)",
     )
     group.add_argument(
         "--shooting",
@@ -244,7 +244,8 @@ def _add_output_error(parser: argparse.ArgumentParser) -> None:
         "--damping",
         choices=("warn", "enforce"),
         default="warn",
-        help="warn of damping terms that would drive the ship, or keep their signs from it (warn)",
+        help="warn of damping terms with a sign that would drive the ship, or enforce the other "
+        "sign (warn)",
     )
 
 
@@ -285,8 +286,8 @@ def _require_heeded(options: argparse.Namespace) -> None:
             # measured is how it is done where nothing is asked for
             if getattr(options, name) not in (parser.get_default(name), "measured"):
                 raise UsageError(
-                    f"--{name.replace('_', '-')} is heeded by --method {' and '.join(methods)} "
-                    f"only, and --method is {options.method}: leave one of them out."
+                    f"--{name.replace('_', '-')} applies to --method {' and '.join(methods)} "
+                    f"only, but --method is {options.method}: leave one of them out."
                 )
 
 

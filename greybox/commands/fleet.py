@@ -17,7 +17,8 @@ from greybox.commands.common import (
 if TYPE_CHECKING:
     from greybox.report.page import Page
 
-HELP = "estimate many ships of one class: what they share, which one differs, what changes in time"
+HELP = "estimate many ships of one class: what they share, which ship differs, what changes over "
+"time"
 EXAMPLES = """examples:
   greybox fleet ferries --out ferries.csv --report ferries.html
   greybox fleet ferries --json ferries.json --cluster tcp://host:8786
@@ -28,8 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "fleet", metavar="DIR",
-        help="folder with one folder a ship, each with a vessel file (*.toml) and logs (CSV, "
-        "Parquet), in order of time by their dates or names",
+        help="folder with one sub-folder per ship, each with a vessel file (*.toml) and logs "
+        "(CSV, Parquet) in the order of their dates or names",
     )  # fmt: skip
     parser.add_argument(
         "--out", metavar="CSV", help="write a table with a row for each coefficient of each ship"

@@ -44,8 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="CSV",
-        help="write the run that the intervals are about as a log; several runs become a file "
-        "each, with side and angle in its name",
+        help="write the run of the estimate itself as a log; of several runs each has a file, "
+        "named by side and angle",
     )
     how = parser.add_argument_group("manoeuvre")
     how.add_argument(
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--share",
         type=float,
         metavar="S",
-        help="for a ship that propeller speeds steer: share of the approach's speed by which the "
+        help="for a ship steered by propeller speeds: share of the approach's speed by which the "
         "two sides differ from it (0.5), or share of a tunnel thruster's highest speed (1)",
     )
     how.add_argument(
@@ -100,19 +100,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--course", type=float, default=0.0, metavar="DEG", help="heading of the approach [deg] (0)"
     )
     approach.add_argument(
-        "--current", action="store_true", help="keep the model's current; still water otherwise"
+        "--current",
+        action="store_true",
+        help="predict in the model's current; by default in still water",
     )
     approach.add_argument(
         "--no-limits",
         action="store_true",
-        help="leave the vessel file's ranges of the commands, but keep its rates",
+        help="ignore the vessel file's ranges of the commands, but keep its rates",
     )
     other = parser.add_argument_group("intervals and trial")
     other.add_argument("--trial", metavar="LOG", help="compare with the same manoeuvres in a log")
     other.add_argument(
         "--disturbed",
         action="store_true",
-        help="add the model's process noise, so that the intervals hold a single trial",
+        help="add the model's process noise, so that the intervals cover a single trial",
     )
     other.add_argument(
         "--scale",

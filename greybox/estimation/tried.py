@@ -108,7 +108,7 @@ class Comparison(DisplayMixin):
             if self.chosen is None
             else f"{self.chosen.label} (thrust ~ {self.chosen.thrust})"
         )
-        return f"{taken} was taken: {self.rule}."
+        return f"{taken} was chosen: {self.rule}."
 
     @property
     def ordered(self) -> list[TriedModel]:

@@ -84,7 +84,8 @@ _TIE = (
     "and below mended, with their root mean square disagreement over the log."
 )
 _DOUBT = (
-    " The velocities of the whole log come no closer by this repair: judge it before you apply it."
+    " This repair brings the velocities of the whole log no closer together: judge it before you "
+    "apply it."
 )
 
 
@@ -303,7 +304,7 @@ def _section(
             continue
         figure, doubt = _drawn(f, report, vessel)
         if len(f.logs) > 1 and shown[f.key] != report.name and not doubt:
-            sentences.append(f"{f.line}; drawn for {shown[f.key]}, with which it is shared.")
+            sentences.append(f"{f.line}; drawn for {shown[f.key]}, where it was found, too.")
             continue
         svg = to_svg(figure, f"log{number}finding{k}")
         pictures.append(Picture(svg, f"{said}{doubt}", f"{alternative(f)}{doubt}"))

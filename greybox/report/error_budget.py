@@ -64,7 +64,8 @@ def budget_table(budget: Sequence[BudgetPart]) -> Table:
         for p in budget
     ]
     head = ["part", *(LABELS.get(s, s).split(" [")[0] for s in states)]
-    caption = "Whose the squared held-out error is, before mending [%] (95 % interval)"
+    caption = "Sources of the squared held-out error before the model is extended [%] (95 % "
+    "interval)"
     return Table(caption, head, rows)
 
 
@@ -95,9 +96,7 @@ def noise_sentence(budget: Sequence[BudgetPart], gain: Mapping[str, Gain]) -> st
         told.append(f"{name} {100 * share:.0f} %")
         if state in gain:
             bounds.append(f"{name} {100 - (100 - gain[state].after) * share**0.5:.0f} %")
-    said = (
-        f"Of the squared error that is left, this much is noise of the sensors: {', '.join(told)}"
-    )
+    said = f"Sensor noise makes up this much of the squared error that is left: {', '.join(told)}"
     if bounds:
         said += (
             f". Measured with that noise, a perfect model would have a fit of about "

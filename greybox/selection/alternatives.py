@@ -31,7 +31,7 @@ _HELD_OUT = 1 / 3
 # parts of the held-out runs, for a standard error
 _BLOCKS = 6
 # said of what could not be tried
-OVER = "not tried: time was over (--effort)"
+OVER = "not tried: time ran out (--effort)"
 # share of the time that is left that the comparison may take
 _OF_ALL = 0.3
 # refinements of the instruments while alternatives are compared

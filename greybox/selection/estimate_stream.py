@@ -89,7 +89,7 @@ def require_adding(request: Request) -> None:
         asked = f"--covariance {request.covariance}"
     if asked:
         raise UsageError(
-            f"{asked} needs all samples in memory at a time, and these logs are read in passes: "
+            f"{asked} needs all samples in memory at once, and these logs are read in passes: "
             f"give it more --memory or fewer logs, or use --method {' or '.join(_ADDING)} with "
             f"--covariance cluster."
         )

@@ -290,9 +290,7 @@ def select_terms(
             f"taken."
         )
     if watch.cut:
-        said += (
-            f" Time was over (--effort) before larger sets were tried on {', '.join(watch.cut)}."
-        )
+        said += f" Time ran out (--effort) before larger sets were tried on {', '.join(watch.cut)}."
     known = {
         extent(fitting): found
         for (fitting, _), found in zip(_judging_parts(logs), shorter, strict=True)

@@ -350,7 +350,10 @@ def _calibrated(
     known = [e for e in errors if e is not None]
     sides = cross_calibrated(known, states)
     if not sides:
-        return {}, [*told, NoBands("a single run was left out, and none is left to calibrate it")]
+        return {}, [
+            *told,
+            NoBands("only one run was held out, and a band is calibrated on the others"),
+        ]
     outward = [
         e.error / np.maximum(np.where(e.error < 0, *side), _NONE)
         for e, side in zip(known, sides, strict=True)

@@ -103,7 +103,7 @@ def test_a_broken_file_of_a_stream_is_left_out_and_named(folder, tmp_path):
 def test_what_needs_all_samples_is_refused_of_a_stream(folder, capsys, options, asked):
     common = ["estimate", str(folder), "--vessel", "thesis", "--memory", "0.001"]
     assert main([*common, *options]) == 1
-    assert f"{asked} needs all samples in memory at a time" in capsys.readouterr().err
+    assert f"{asked} needs all samples in memory at once" in capsys.readouterr().err
 
 
 def test_structures_are_compared_on_stretches_of_a_stream(folder, tmp_path):

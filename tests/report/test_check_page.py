@@ -334,8 +334,8 @@ def test_what_logs_share_is_drawn_once_and_where_its_repair_does_not_help(tmp_pa
     html = without_scripts(path.read_text())
     # track and signals of each log beside them
     assert html.count("<svg") == 2 + 3 * 2
-    assert html.count("drawn for a, with which it is shared.") == 1
-    assert "come no closer by this repair" in html
+    assert html.count("drawn for a, where it was found, too.") == 1
+    assert "This repair brings the velocities of the whole log no closer" in html
 
 
 @pytest.mark.long
