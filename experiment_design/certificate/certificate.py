@@ -103,7 +103,7 @@ _GRID_CHECKED = (
 
 
 class Kind(Enum):
-    """What a certificate says."""
+    """The kind of a certificate."""
 
     PROVEN = "proven"
     NUMERICAL = "numerical"
@@ -406,7 +406,7 @@ def certify(
     budget: int | None = None,
     effort: float = 1.0,
 ) -> Certificate:
-    """Bound what any admissible inputs of one or several trials could reach.
+    """Bound the criterion of all admissible inputs of one or several trials.
 
     In a campaign the covariance of the summed moments is no smaller than that of
     the summed information G M⁻¹ G, to which each trial adds its own part.

@@ -1,4 +1,4 @@
-"""The page of `greybox design`: what the plan is worth, and how it will look."""
+"""The page of `greybox design`: the value of the plan, and the motion to expect."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def _sentence(text: str) -> str:
 
 
 def saving(design: Design) -> str:
-    """Return what the plan saves, and how near it is to the best possible."""
+    """Return how much time the plan saves, and how near it is to the best possible."""
     r = design.request
     whole = r.duration * r.trials
     gain = design.efficiency_vs_random

@@ -1,4 +1,4 @@
-"""What the bridge needs to know of one trial, in words and cells: no layout."""
+"""The contents of the trial sheet for the bridge, in words and cells, without layout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What sub-commands share: logs, progress, the record of a computation."""
+"""Shared parts of the sub-commands: options, logs, outputs, the record of a computation."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def _require_outside(options: argparse.Namespace) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Estimate, pool, tell."""
+    """Estimate, pool, report."""
     from greybox.files import check_targets, sha256, write_text
     from greybox.fleet.fleet import estimate_fleet
     from greybox.fleet.ships import fleet_files

@@ -1,4 +1,4 @@
-"""The parser of the command line: one sentence for what is mistyped, with the nearest name."""
+"""The parser of the command line: one sentence for a mistake, with the nearest name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a model's free run is good for on logs that took no part, as values.
+"""How well a model's free run predicts held-out logs, as values.
 
 The numbers come from `greybox.validation.judge_prediction`; here they are weighed
 against limits, and sentences are rendered from them.
@@ -25,7 +25,7 @@ def channel_words(channel: str) -> str:
 
 
 class PredictionLevel(StrEnum):
-    """What a free run is good for; the values are the words that users read."""
+    """How well a free run predicts; the values are the words that users read."""
 
     GOOD = "good"
     LIMITED = "limited"
@@ -390,7 +390,7 @@ class NothingHeldOut(Reason):
 
 @dataclass(frozen=True)
 class NotRefitted(Reason):
-    """Some parts could not be left out: the others do not do for an estimate, or time was short.
+    """Some parts could not be left out: the rest does not give an estimate, or time was short.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ _STATIONARY = 8.0
 
 @dataclass(frozen=True)
 class HeldOutErrors:
-    """What free runs on logs that took no part miss.
+    """Errors of free runs on held-out logs.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a reader of a prediction has to know, one sentence each."""
+"""Notes on a prediction, one sentence each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The error budget on a page: whose the squared error is, before mending and after."""
+"""The error budget on a page: sources of the squared error, before and after the extension."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ def alternatives_for(
 
 
 def structures_to_try(logs: Sequence[TrialLog], wind: bool) -> list[str]:
-    """Return the structures to try where the user names none, the fullest first.
+    """Return the structures to try where the user names none, the largest first.
 
     On a nearly constant heading an unmeasured wind or current is a constant
     force, which the bias-capturing terms cannot be told from.

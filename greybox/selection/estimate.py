@@ -714,7 +714,7 @@ def _finished(
 def with_runs(
     estimate: Estimate, logs: Sequence[TrialLog], notes: Sequence[str] = (), reason: str = ""
 ) -> tuple[Estimate, bool]:
-    """Return an estimate with its free-run fit and what that says, and whether a run diverges.
+    """Return an estimate with its free-run fit and notes on it, and whether a run diverges.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""An estimate from logs larger than memory: sums over all samples, tests on what tells most."""
+"""An estimate from logs larger than memory: sums over all samples, tests on selected stretches."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class StreamEstimate:
 
 
 def require_adding(request: Request) -> None:
-    """Refuse what needs all samples at a time.
+    """Refuse options that need all samples in memory at once.
 
     Raises
     ------

@@ -45,7 +45,7 @@ _MANY = 10_000
 def with_prediction(
     estimate: Estimate, logs: Sequence[TrialLog], request: Request, refit: Refit | None = None
 ) -> Estimate:
-    """Return an estimate with what its free run is good for on logs that took no part.
+    """Return an estimate with the verdict on its prediction of held-out logs.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def part_of_estimate(log: TrialLog) -> UsageError:
 
 
 def require_distinct(logs: Sequence[TrialLog]) -> None:
-    """Refuse logs of equal samples: copies count as new trials, and judge what they took part in.
+    """Refuse logs of equal samples, since copies would count as further, independent trials.
 
     Raises
     ------

@@ -89,7 +89,7 @@ class Terms:
 
 @dataclass(frozen=True)
 class Step:
-    """How a model goes over a sample, and what logged commands do during it."""
+    """The integrator of a model, and how logged commands run between samples."""
 
     integrator: Integrator = "euler"
     commands: Between = "held"

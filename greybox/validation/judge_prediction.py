@@ -1,4 +1,4 @@
-"""What free runs are good for on logs that took no part in the estimate of their model."""
+"""The verdict on a model's prediction, from free runs on held-out logs."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def judge_prediction(
     seed: int = 0,
     errors: Sequence[RunErrors | None] | None = None,
 ) -> PredictionVerdict:
-    """Say what free runs are good for.
+    """Judge how well free runs predict.
 
     Parameters
     ----------

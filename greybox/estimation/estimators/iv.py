@@ -1,4 +1,4 @@
-"""Instrumental variables, refined by the noise where nothing speaks against it: ``--method iv``."""
+"""Instrumental variables, refined by a noise model where the tests allow it: ``--method iv``."""
 
 from __future__ import annotations
 
