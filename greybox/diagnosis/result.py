@@ -284,7 +284,7 @@ class Diagnosis(DisplayMixin):
     wrong : tuple of Symptom
         Largest first.
     partial : tuple of Found
-        Causes that help, and do no more than a force without a name would.
+        Causes that help, and do no more than a generic force would.
     candidates : tuple of Found
         Members of the groups, each as it would be by itself.
     base, model : ManoeuvringModel
