@@ -97,7 +97,7 @@ def headline(diagnosis: Diagnosis, demo: Demo) -> str:
     hidden = [e.id for e in demo.hidden]
     asked = f"A ship sailed with a hidden effect that its model lacked, {' and '.join(hidden)}"
     if ids == hidden:
-        return f"{asked}: the trial was designed, the cause found and named, the model mended."
+        return f"{asked}: the trial was designed, the cause found and named, the model extended."
     return f"{asked}; the verdict of these logs is '{diagnosis.verdict}'" + (
         f", with {', '.join(ids)} named." if ids else "."
     )

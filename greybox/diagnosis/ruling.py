@@ -282,8 +282,9 @@ def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> st
 
 def _next(verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]]) -> list[str]:
     out = [
-        f"design a trial that tells {' from '.join(ids)}: greybox design "
-        f"--between {' '.join(f'MODEL.{file_word(i)}.json' for i in ids[:2])}"
+        f"design a trial that tells {' from '.join(ids)}: greybox design --vessel V "
+        f"--between {' '.join(f'MODEL.{file_word(i)}.json' for i in ids[:2])} --duration 900 "
+        f"--out plan.csv"
         for ids in ([c.hypothesis.id for c in pair] for pair in groups)
     ]
     if verdict in (DiagnosisVerdict.UNEXPLAINED, DiagnosisVerdict.PARTLY):
@@ -294,7 +295,8 @@ def _next(verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]]) -> l
     if verdict in (DiagnosisVerdict.NAMED, DiagnosisVerdict.PARTLY):
         out.append(
             "design the next trial with the extended model, so that its least certain "
-            "coefficients move: greybox design --model MODEL"
+            "coefficients move: greybox design --vessel V --model MODEL --duration 900 "
+            "--out plan.csv"
         )
     if verdict is DiagnosisVerdict.NONE:
         out.append("the model may be used as it is; a trial in other conditions would tell more")

@@ -333,7 +333,7 @@ class LargeError(Reason):
             return f"{who} is worse than a constant {when}"
         return (
             f"the error of {who} is {100 * self.error:.0f} % of its spread "
-            f"(at most {100 * self.limit:.0f} asked)"
+            f"({100 * self.limit:.0f} % is allowed)"
         )
 
 
@@ -362,7 +362,7 @@ class NarrowBands(Reason):
         return (
             f"the 95 % bands of {channel_words(self.channel)} hold {100 * self.share:.0f} % "
             f"({100 * self.interval[0]:.0f}-{100 * self.interval[1]:.0f}) of the measurements "
-            f"(at least {100 * self.limit:.0f} asked)"
+            f"({100 * self.limit:.0f} % is required)"
         )
 
 
@@ -561,7 +561,7 @@ class PredictionVerdict(DisplayMixin):
         return (
             f"the error of {', '.join(c.words for c in self.channels if c.moves)} is at most "
             f"{100 * max(c.error for c in self.channels if c.moves):.0f} % of the spread "
-            f"({100 * self.limits.good:.0f} asked)"
+            f"({100 * self.limits.good:.0f} % is allowed)"
         )
 
     @property

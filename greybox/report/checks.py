@@ -136,7 +136,7 @@ def check_page(
         "the water is allowed for"
     )
     page = Page(
-        title="What is wrong with the log" if len(reports) == 1 else "What is wrong with the logs",
+        title="Check of the log" if len(reports) == 1 else "Check of the logs",
         headline=headline(reports),
         sections=sections,
         lead=lead,
@@ -153,7 +153,7 @@ def headline(reports: Sequence[CheckReport]) -> str:
     if not found:
         open_ids = sorted({o.id for r in reports for o in r.outcomes if o.status == "cannot tell"})
         vague = f"; nothing can be said of {', '.join(open_ids)}" if open_ids else ""
-        return f"No findings in {logs}{vague}."
+        return f"Nothing wrong was found in {logs}{vague}."
     report = reports[_gravest(reports)]
     finding = min(report.findings, key=_seriousness)
     several = {f.key for f in shared_findings(reports)}

@@ -30,7 +30,7 @@ def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
         ax.barh(places, share, 0.72, color=BLUE, edgecolor="0.2", linewidth=0.6, label="before")
         ax.barh(
             places, [100 * p.after[state] for p in budget], 0.3, color=ORANGE, edgecolor="0.2",
-            linewidth=0.6, label="after mending",
+            linewidth=0.6, label="after the extension",
         )  # fmt: skip
         ax.hlines(places, low, high, color="0.2", linewidth=1.0, label="95 % interval of before")
         ax.axvline(0, color="0.2", linewidth=0.8)
@@ -41,7 +41,7 @@ def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
         tidy(ax)
     axes[0].set_yticks(places, [p.part for p in budget], fontsize=8.5)
     axes[0].set_ylim(len(budget) - 0.4, -0.6)
-    figure.supxlabel("share of the squared error before mending [%]", fontsize=9)
+    figure.supxlabel("share of the squared error before the extension [%]", fontsize=9)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside upper left", ncols=3, fontsize=8, frameon=False,

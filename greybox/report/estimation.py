@@ -23,6 +23,8 @@ from greybox.estimation.tried import Comparison
 from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult, TrustLevel
 from greybox.model.terms import parameter_unit
+from greybox.prediction.helm import find_helm
+from greybox.prediction.steady import kept_from_straight
 from greybox.report.chart import chart_of
 from greybox.report.estimation_figures import (
     MOST_DRAWN,
@@ -138,11 +140,13 @@ def _next_steps(estimate: Estimate, record: Mapping[str, Any]) -> list[NextStep]
                 f"greybox diagnose {logs} --vessel {vessel}{held} --report diagnosis.html",
             )
         )
-    if level is PredictionLevel.GOOD:
+    helm = find_helm(estimate.vessel)
+    if level is PredictionLevel.GOOD and helm.kind != "none":
+        free = " --no-limits" if kept_from_straight(helm) else ""
         steps.append(
             NextStep(
                 "Predict manoeuvres of the ship",
-                f"greybox predict {model} zigzag --report zigzag.html",
+                f"greybox predict {model} zigzag{free} --report zigzag.html",
             )
         )
     if level is PredictionLevel.NOT_JUDGED:

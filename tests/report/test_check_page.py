@@ -348,9 +348,11 @@ def test_identifiers_of_several_logs_do_not_collide(tmp_path):
 
 def test_headline_names_the_most_serious():
     clean = report_of([], None)
-    assert headline([clean, clean]) == "No findings in 2 logs."
+    assert headline([clean, clean]) == "Nothing wrong was found in 2 logs."
     vague = replace(clean, outcomes=(Outcome("lever_arm", "cannot tell", "too straight"),))
-    assert headline([vague]) == "No findings in 1 log; nothing can be said of lever_arm."
+    assert (
+        headline([vague]) == "Nothing wrong was found in 1 log; nothing can be said of lever_arm."
+    )
     serious = reading_case("rate reversed")
     mixed = replace(serious, findings=(*row_case("gap").findings, *serious.findings), name="b")
     said = headline([clean, mixed])

@@ -158,7 +158,7 @@ def test_limits_separate_the_levels():
     assert judged(channel("v", just)).level is PredictionLevel.LIMITED
     poor = judged(channel("u", just + 0.01), channel("v", bad, horizon=0.0))
     assert poor.text == (
-        "poor: the error of surge is 71 % of its spread (at most 50 asked); "
+        "poor: the error of surge is 71 % of its spread (50 % is allowed); "
         "sway is worse than a constant from the start"
     )
 
@@ -179,7 +179,7 @@ def test_bands_that_miss_limit_the_model_where_that_is_certain():
     assert judged(channel("u", 0.2, bands=few)).text == "good"
     found = judged(channel("u", 0.2, bands=many))
     assert found.text == (
-        "limited: the 95 % bands of surge hold 80 % (74-85) of the measurements (at least 85 asked)"
+        "limited: the 95 % bands of surge hold 80 % (74-85) of the measurements (85 % is required)"
     )
 
 
