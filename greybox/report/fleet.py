@@ -138,8 +138,8 @@ def _map(fleet: Fleet) -> Picture:
     bar.ax.tick_params(labelsize=8)
     few = f" Of {len(fleet.ships)} ships the {len(shown)} most deviating are drawn."
     caption = (
-        "How far the own estimate of each ship lies from the mean of the class, in standard "
-        "deviations of error and spread together; a frame marks in what a ship differs beyond "
+        "The deviation of each ship's own estimate from the mean of the class, in standard "
+        "deviations of error and spread together; a frame marks a coefficient that differs beyond "
         f"chance.{few if len(shown) < len(fleet.ships) else ''}"
     )
     far = np.unravel_index(np.abs(deviations).argmax(), deviations.shape)

@@ -194,7 +194,7 @@ def _beside(made: PredictedManoeuvre) -> Table:
 
 
 def _pictures(made: PredictedManoeuvre, key: str) -> list[Picture]:
-    note = "The estimate's own run, and where 95 % of the draws are (shaded)."
+    note = "The estimate's own run, and the range of 95 % of the draws (shaded)."
     if made.agreement is not None:
         note += f" Black: measured in {made.agreement.log}."
     if made.order is None:
@@ -207,7 +207,7 @@ def _pictures(made: PredictedManoeuvre, key: str) -> list[Picture]:
     ]
     if "steering" in made.bundle.nominal:
         panels.append(("steering", "steering [deg]", _DEGREES))
-    drawn = "The track of the estimate's own run, and of some draws."
+    drawn = "Tracks of the estimate's own run and of some draws."
     if made.kind == "zigzag":
         drawn += " Its scales along and across differ."
     return [
