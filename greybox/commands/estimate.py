@@ -87,7 +87,7 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
         default=EFFORT,
         metavar="SECONDS",
         help="time limit for choosing what you leave open [s]; notes name what was not tried "
-        "within it, and the first estimate is always completed ({EFFORT:g})",
+        f"within it, and the first estimate is always completed ({EFFORT:g})",
     )
     chosen = group.add_mutually_exclusive_group()
     chosen.add_argument(
@@ -127,7 +127,7 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         default=MEMORY,
         metavar="GIB",
         help="memory limit [GiB]; larger logs are read in passes, and the tests use their most "
-        "informative stretches ({MEMORY:g})",
+        f"informative stretches ({MEMORY:g})",
     )
     group.add_argument(
         "--validate",
