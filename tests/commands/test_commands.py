@@ -254,6 +254,6 @@ def test_columns_in_another_unit_are_told_by_every_command_that_reads_logs(tmp_p
         assert run(*command) == 0
         said = " ".join(capsys.readouterr().out.split())
         for name, unit in (("psi", "deg"), ("alpha1", "deg"), ("u", "kn"), ("v", "kn")):
-            mend = f'{name} = {{ name = "{name}", unit = "{unit}" }}'
+            mend = f'"{name}" = {{ name = "{name}", unit = "{unit}" }}'
             assert mend in said, (command[0], mend)
             assert any(mend in line for line in found)

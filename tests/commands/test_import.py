@@ -136,7 +136,7 @@ def test_angles_that_cannot_be_radians_are_told(tmp_path, capsys):
     status, out, _ = run(capsys, *given)
     assert status == 0
     assert "note: alpha1 reaches 45.84, above the 12.6 rad that it can reach" in out
-    assert 'write alpha1 = { name = "alpha1", unit = "deg" } under [columns]' in out
+    assert 'write "alpha1" = { name = "alpha1", unit = "deg" } under [columns]' in out
     assert "columns not used: paint (map those that belong to the log in" in out
     status, out, _ = run(capsys, *given, "--fix", "--fix-not", "stuck")
     assert "note: alpha1 reaches" not in out
