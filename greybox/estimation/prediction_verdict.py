@@ -251,9 +251,9 @@ class Elsewhere(Reason):
     def sentence(self) -> str:
         """What was left out, and how far the error went."""
         if self.kinds:
-            what = f"a kind of manoeuvre that its estimate never saw ({', '.join(self.kinds)})"
+            what = f"a kind of manoeuvre that the estimate did not use ({', '.join(self.kinds)})"
         else:
-            what = f"{'a log' if self.whole else 'parts of the log'} that its estimate never saw"
+            what = f"{'a log' if self.whole else 'parts of the log'} that the estimate did not use"
         if self.diverged:
             far = f"its free run diverges in {self.diverged} of {self.count} runs"
         else:
@@ -262,7 +262,7 @@ class Elsewhere(Reason):
                 f"the error of {channel_words(worst)} is {100 * self.errors[worst]:.0f} % of its "
                 f"spread"
             )
-        return f"on {what}, each left out in turn, {far}: give it logs of what it is to predict"
+        return f"on {what}, each left out in turn, {far}: add logs of the motion to be predicted"
 
 
 @dataclass(frozen=True)

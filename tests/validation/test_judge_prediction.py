@@ -130,7 +130,7 @@ def test_what_kinds_of_manoeuvre_left_out_show_is_told_beside_the_level(log):
     wrong = HeldOut.of(true_model(log, Ymu=2.5), log)
     found = judge_prediction([own], own=[own, own], elsewhere=[wrong], kinds=["turn"])
     assert found.level is PredictionLevel.GOOD
-    assert "a kind of manoeuvre that its estimate never saw (turn)" in found.reasons[-1]
+    assert "a kind of manoeuvre that the estimate did not use (turn)" in found.reasons[-1]
     told = found.to_dict()
     assert told["elsewhere_rmse"]["v"] > 2 * told["rmse"]["v"]
 
