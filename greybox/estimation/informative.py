@@ -140,8 +140,9 @@ def require_informative(
         )
     if all(float(np.ptp(log[s])) == 0.0 for log in logs for s in structure.states):
         raise ExcitationError(
-            f"{', '.join(structure.states)} do not change over the whole log, so no motion tells "
-            f"what the commands do: see whether the columns hold what was measured (greybox "
+            f"{', '.join(structure.states)} do not change over the whole log, so the motion does "
+            f"not show what the commands do: see whether the columns hold what was measured "
+            f"(greybox "
             f"check), and give a log in which the ship moves."
         )
     if structure.marine:

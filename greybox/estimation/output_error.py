@@ -682,7 +682,7 @@ def _slow_tests(slow: Mapping[str, tuple[float, float]]) -> tuple[TestResult, ..
         out.append(
             TestResult(
                 "slow_errors",
-                f"the free-run error of {name} is white: nothing beside the model moves it",
+                f"the free-run error of {name} is white: nothing that the model lacks moves it",
                 z,
                 p,
                 f"the free-run error of {name} {found}",

@@ -83,7 +83,7 @@ class PredictionLimits:
 
 LIMITS = PredictionLimits()
 # why parts were not left out where seconds were few
-TOO_SHORT = "time was too short to estimate without a part: give it more with --effort"
+TOO_SHORT = "time was too short to estimate without a part: allow more with --effort"
 
 
 @dataclass(frozen=True)
@@ -415,8 +415,8 @@ class NotRefitted(Reason):
         if not self.in_time:
             return f"{self.parts} of {self.count} parts were not judged: {TOO_SHORT}"
         return (
-            f"{self.parts} of {self.count} parts were not judged: without them the logs do not do "
-            f"for an estimate ({self.because.rstrip('.')})"
+            f"{self.parts} of {self.count} parts were not judged: without them the logs do not "
+            f"suffice for an estimate ({self.because.rstrip('.')})"
         )
 
 
@@ -429,7 +429,7 @@ class NothingMoved(Reason):
     @property
     def sentence(self) -> str:
         """What was seen."""
-        return "no channel moved beyond its noise, so its prediction was not put to the test"
+        return "no channel moved beyond its noise, so its prediction was not tested"
 
 
 @dataclass(frozen=True)

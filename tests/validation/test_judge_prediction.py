@@ -170,7 +170,7 @@ def test_what_hardly_moves_does_not_decide():
     assert "yaw rate hardly moved (0.02 m/s beside a noise of 0.1)" in found.reasons[0]
     nothing = judged(still)
     assert nothing.text == (
-        "poor: no channel moved beyond its noise, so its prediction was not put to the test"
+        "poor: no channel moved beyond its noise, so its prediction was not tested"
     )
 
 
