@@ -168,7 +168,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     goal.add_argument(
         "--diagnosis",
         metavar="D",
-        help="JSON of greybox diagnose: its open causes are to be told apart (that of MODEL)",
+        help="JSON of greybox diagnose whose open causes the trial must separate (that of MODEL)",
     )
     goal.add_argument(
         "--causes",
@@ -326,7 +326,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_share,
         default=0.9,
         metavar="P",
-        help="probability with which limits are to be kept under the prior's uncertainty (0.9)",
+        help="probability with which the limits must be kept under the prior's uncertainty (0.9)",
     )
     work = parser.add_argument_group("how")
     work.add_argument(

@@ -315,7 +315,7 @@ def _choose(
     if options.structure is not None:
         raise UsageError(
             f"--structure names '{options.structure}' and --compare-structures "
-            f"{len(options.compare_structures)} more: name all that are to be compared there."
+            f"{len(options.compare_structures)} more: name all structures to compare there."
         )
     return compare_structures(
         logs, options.compare_structures, request, progress("structures compared")

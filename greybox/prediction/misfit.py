@@ -1,4 +1,4 @@
-"""Forces that a structure lacks, as large as its runs on logs that took no part say."""
+"""Forces that a structure lacks, of the size that its errors on held-out logs show."""
 
 from __future__ import annotations
 

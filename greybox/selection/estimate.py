@@ -583,7 +583,7 @@ def _or_output_error(
         if _rank(tried)[0] == 2:
             why = (
                 f"its free run is better than a constant in more of the states, though neither "
-                f"is to be trusted: {before}"
+                f"can be trusted: {before}"
             )
         note = f"{other.words} was chosen, because {why}."
         return _noting(tried, note, compared(True, str(tried.verdict.level))), tried

@@ -178,8 +178,8 @@ def require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> No
 def part_of_estimate(log: TrialLog) -> UsageError:
     """Return the error that a log validates an estimate which it is part of."""
     return UsageError(
-        f"'{log.name}' is to be estimated on and to validate the estimate: a log that took part "
-        f"cannot judge. Name it once."
+        f"'{log.name}' is given both to estimate on and to validate: a log that the estimate used "
+        f"cannot judge it. Name it once."
     )
 
 

@@ -47,7 +47,7 @@ _NONE, _FAR = 1e-300, 1e6
 
 @dataclass(frozen=True)
 class HeldOut:
-    """A free run on a log that took no part in the estimate of its model.
+    """A free run on a log that the estimate did not use of its model.
 
     Parameters
     ----------

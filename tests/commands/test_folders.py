@@ -118,4 +118,4 @@ def test_structures_are_compared_on_stretches_of_a_stream(folder, tmp_path):
 def test_a_file_of_a_stream_does_not_validate_it(folder, capsys):
     options = [*OPTIONS, "--memory", "0.001", "--validate", str(folder / "day1.csv")]
     assert main(["estimate", str(folder), *options]) == 1
-    assert "a log that took part cannot judge" in capsys.readouterr().err
+    assert "a log that the estimate used cannot judge it" in capsys.readouterr().err

@@ -256,7 +256,7 @@ def _forces(logs: Sequence[_Log], vessel: Vessel) -> None:
             (f for f in log.findings if f.id in ("sign", "frame", "unit") and not f.safe), None
         )
         if doubt is not None:
-            said = f"the {doubt.id} of {', '.join(doubt.channels)} is to be settled first"
+            said = f"the {doubt.id} of {', '.join(doubt.channels)} must be settled first"
             log.say([Outcome("external_force", "cannot tell", said)])
             continue
         log.findings += forces
