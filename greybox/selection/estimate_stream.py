@@ -129,7 +129,7 @@ def estimate_stream(
     notes: list[str] = []
     if request.method is None:
         notes.append(
-            f"{ESTIMATORS[_ADDING[0]].words} were taken: of the methods whose sums add over a "
+            f"{ESTIMATORS[_ADDING[0]].words} were chosen: of the methods whose sums add over a "
             f"stream, noise in the regressors does not bias them."
         )
     request = replace(request, method=request.method or _ADDING[0], prefilter="none")

@@ -278,7 +278,7 @@ def select_terms(
         f"the logs); "
         + (
             f"the smallest set whose error is larger than the least by no more than one standard "
-            f"error and {_GIVEN_AWAY:g} % was taken."
+            f"error and {_GIVEN_AWAY:g} % was chosen."
             if chosen
             else f"{present} stays."
         )

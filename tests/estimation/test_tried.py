@@ -18,10 +18,10 @@ COMPARED = Comparison("published structures", "held-out runs", "the fullest with
 def test_the_best_comes_first_and_what_was_taken_is_marked_with_its_reason():
     assert [r.structure for r in COMPARED.ordered] == ["linear", "thesis", "linear"]
     head, rows = COMPARED.table()
-    assert [row[head.index("taken")] for row in rows] == ["", "taken", ""]
+    assert [row[head.index("chosen")] for row in rows] == ["", "chosen", ""]
     assert rows[-1][head.index("score [%]")] == "–"
     assert COMPARED.decision == (
-        "iv, augmented, 19 terms: thesis (thrust ~ n) was taken: the fullest within one error."
+        "iv, augmented, 19 terms: thesis (thrust ~ n) was chosen: the fullest within one error."
     )
 
 
