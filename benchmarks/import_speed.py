@@ -54,7 +54,7 @@ def write_nmea(path: Path, sentences: int) -> Path:
 
 def run_import(raw: Path, out: Path) -> None:
     """Run `greybox import` in a process of its own."""
-    command = [sys.executable, "-m", "greybox.commands.main", "import", str(raw)]
+    command = [sys.executable, "-m", "greybox", "import", str(raw)]
     command += ["--vessel", "thesis", "--out", str(out)]
     subprocess.run(command, check=True, capture_output=True)
 

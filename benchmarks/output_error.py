@@ -324,7 +324,7 @@ def speed(samples: int, repeats: int) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "trial.csv"
         write_log([log], path)
-        command = [sys.executable, "-m", "greybox.commands.main", "estimate", str(path)]
+        command = [sys.executable, "-m", "greybox", "estimate", str(path)]
         command += ["--vessel", "thesis", "--method", "oe"]
         same = ["--structure", "thesis", "--predictor", "wind", "--heading", "measured"]
         for label, more in (("command, all chosen", []), ("command, same model", same)):

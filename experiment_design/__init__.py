@@ -1,4 +1,4 @@
-"""Design of trials: the most informative thruster sequences, and what they would tell.
+"""Design of trials: the most informative thruster sequences, and their predicted precision.
 
 Imports run down this list, never up: `command` and `demo`; what a program calls
 (`discriminate`, `design`, `prepare`, `precision`); `output`; `certificate` and

@@ -1,4 +1,4 @@
-"""What has been sailed of a trial, as the design of its rest sees it."""
+"""The part of a trial that has been sailed, for the design of its rest."""
 
 from __future__ import annotations
 

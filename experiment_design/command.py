@@ -133,15 +133,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="LOG",
-        help="logs of what has been sailed, in this order: the model is estimated on them unless "
-        "--model names one, and the plan adds what they do not tell",
+        help="logs that have been sailed, in this order: the model is estimated on them unless "
+        "--model names one, and the plan adds the information that they lack",
     )
-    add("--remaining", type=positive, metavar="S", help="as --duration, after --after [s]")
+    add(
+        "--remaining",
+        type=positive,
+        metavar="S",
+        help="what --duration is without --after: how long the rest of the trial may last [s]",
+    )
     add("--save-model", metavar="FILE", help="write the model that --after estimates (JSON)")
     add("--out", required=True, metavar="PLAN", help="where to write the commands (CSV)")
     add("--json", metavar="F", help="write the design as JSON; - is stdout")
     add("--sheet", metavar="FILE", help="write the sheet to take on board: .pdf, .html, .svg, .png")
-    add("--report", metavar="HTML", help="write a page with pictures and what the plan is worth")
+    add("--report", metavar="HTML", help="write a page with pictures and the value of the plan")
     add(
         "--legs",
         nargs="?",
@@ -150,20 +155,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the plan as legs too, each of which ends by time, heading, speed or yaw rate: "
         "as JSON, as CSV and in words on the sheet (PLAN with the ending .legs.json)",
     )
-    goal = parser.add_argument_group("what is to be learnt")
+    goal = parser.add_argument_group("purpose")
     goal.add_argument(
         "--for",
         dest="purpose",
         choices=PURPOSES,
-        help="what the trial is for: predictions to both sides over the operating envelope, with "
-        "the misfit of the structure counted (prediction, unless one of "
+        help="what the trial is for: predictions to both sides over the operating envelope, "
+        "allowing for the misfit of the structure (prediction, unless one of "
         f"{', '.join(map(spelt, COEFFICIENTS))} is given), the precision of coefficients in one "
         "regime, or telling causes apart",
     )
     goal.add_argument(
         "--diagnosis",
         metavar="D",
-        help="JSON of greybox diagnose: its open causes are to be told apart (that of MODEL)",
+        help="JSON of greybox diagnose whose open causes the trial must separate (that of MODEL)",
     )
     goal.add_argument(
         "--causes",
@@ -212,12 +217,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--prior",
         metavar="MODEL",
         help="model of earlier trials, whose information counts as known; none: start from the "
-        "vessel's main dimensions, without trial and --model",
+        "vessel's main dimensions, without a trial and --model",
     )
     goal.add_argument(
-        "--between", nargs=2, metavar=("A", "B"), help="two models that the trial is to tell apart"
+        "--between", nargs=2, metavar=("A", "B"), help="two models for the trial to tell apart"
     )
-    motion = parser.add_argument_group("what the trial must keep")
+    motion = parser.add_argument_group("limits")
     motion.add_argument("--regime", metavar="u+v+", help="signs of the velocities to keep (auto)")
     for name, word in (("u", "surge"), ("v", "sway")):
         motion.add_argument(
@@ -286,7 +291,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     motion.add_argument(
         "--headings", type=positive, metavar="RAD", help="range of headings to cover [rad]"
     )
-    belief = parser.add_argument_group("what is believed beforehand")
+    belief = parser.add_argument_group("prior knowledge")
     belief.add_argument(
         "--current", type=_pair, metavar="N,E", help="expected current, north and east [m/s]"
     )
@@ -321,7 +326,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_share,
         default=0.9,
         metavar="P",
-        help="probability with which limits are to be kept under the prior's uncertainty (0.9)",
+        help="probability with which the limits must be kept under the prior's uncertainty (0.9)",
     )
     work = parser.add_argument_group("how")
     work.add_argument(
@@ -330,7 +335,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the closest plan where the limits cannot all be kept",
     )
     work.add_argument(
-        "--effort", type=positive, default=1.0, help="search this many times as long (1)"
+        "--effort", type=positive, default=1.0, help="multiply the length of the search by this (1)"
     )
     work.add_argument("--workers", type=_whole, metavar="N", help="number of processes (as needed)")
     add_cluster(work)

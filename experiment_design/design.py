@@ -1,4 +1,4 @@
-"""Design of trials: from a request to sequences with what they are worth."""
+"""Design of trials: from a request to sequences, with their information and limits."""
 
 from __future__ import annotations
 

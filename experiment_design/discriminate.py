@@ -1,4 +1,4 @@
-"""The trial that tells two explanations apart, and how sure one will be afterwards."""
+"""The trial that separates two explanations, and the probability of the right decision."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The trial after which a diagnosis tells the causes apart that the last one left open."""
+"""The design of a trial that separates the causes that the last diagnosis left open."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What any given sequence would tell: predicted standard errors before anyone goes to sea."""
+"""The predicted standard errors of any given sequence, before the trial."""
 
 from __future__ import annotations
 

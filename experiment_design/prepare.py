@@ -1,4 +1,4 @@
-"""From what a user gives to a complete request: noises, margins, regimes and starts chosen."""
+"""Completion of a user's request: noise, margins, regimes and starts are chosen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Registries: what there is of a kind, by name, so that a new one is one file."""
+"""Registries: the entries of a kind by name, so that a new one is one file."""
 
 from __future__ import annotations
 

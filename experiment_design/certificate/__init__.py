@@ -1,1 +1,1 @@
-"""Upper bounds on what any sequence could reach, and how close a design comes to them."""
+"""Upper bounds on the criterion of any sequence, and how close a design comes to them."""

@@ -103,7 +103,7 @@ _GRID_CHECKED = (
 
 
 class Kind(Enum):
-    """What a certificate says."""
+    """The kind of a certificate."""
 
     PROVEN = "proven"
     NUMERICAL = "numerical"
@@ -160,7 +160,7 @@ class Certificate(DisplayMixin):
     def sentence(self) -> str:
         """Return one sentence for the summary of a design."""
         if self.kind is Kind.NOT_INFORMATIVE:
-            return "certificate: not informative"
+            return "certificate: not informative (its bound is more than 10 times the plan)"
         if self.efficiency_lower_bound is None:
             return f"certificate: not available because {self.reason}"
         kind = "proven" if self.rigorous else "numerical bound"
@@ -406,7 +406,7 @@ def certify(
     budget: int | None = None,
     effort: float = 1.0,
 ) -> Certificate:
-    """Bound what any admissible inputs of one or several trials could reach.
+    """Bound the criterion of all admissible inputs of one or several trials.
 
     In a campaign the covariance of the summed moments is no smaller than that of
     the summed information G M⁻¹ G, to which each trial adds its own part.

@@ -1,1 +1,1 @@
-"""What a trial must keep, as plain data and as compiled functions."""
+"""The limits of a trial, as plain data and as compiled functions."""

@@ -1,4 +1,4 @@
-"""What a trial must keep, as plain data, and what a limit is; each kind is one file of `kinds`.
+"""The limits of a trial as plain data, and the base class of a limit; each kind is one file.
 
 A limit is one number h at each sample or one a trial, negative where it is kept.
 """
@@ -119,7 +119,7 @@ class LimitedTrial:
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What may explain why a limit cannot be kept.
+    """Circumstances that may explain why a limit cannot be kept.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""What a trial is designed for: numbers of its motion that are to be large, one a file."""
+"""Objectives of a design, computed from the motion and maximised, one file each."""

@@ -86,7 +86,7 @@ class OpenCause:
 
 @dataclass(frozen=True)
 class PowerReport:
-    """What one sequence would tell of the open causes.
+    """How well one sequence would separate the open causes.
 
     Parameters
     ----------

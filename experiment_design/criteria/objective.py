@@ -1,4 +1,4 @@
-"""What a sequence is chosen by: a number of its motion that is made large, with its derivatives."""
+"""The objective of a design: a function of the motion to maximise, with its derivatives."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Slope:
 
 
 class Objective(ABC):
-    """A logarithm that grows with what a trial tells."""
+    """The logarithm of the information of a trial, for some purpose."""
 
     @property
     @abstractmethod

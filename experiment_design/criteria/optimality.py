@@ -1,4 +1,4 @@
-"""Optimality criteria by name: what of the covariance of the wanted parameters is to be small.
+"""Optimality criteria by name: the function of the wanted parameters' covariance to minimise.
 
 Every criterion is a number that grows with the information, in logarithms, so that
 they share one scale. A new one is a file of `kinds` with its entry, or an entry point.

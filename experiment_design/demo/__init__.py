@@ -1,1 +1,1 @@
-"""The whole loop on a virtual ship: what `greybox demo` runs, tells and draws."""
+"""The whole loop on a virtual ship, which `greybox demo` runs, reports and draws."""

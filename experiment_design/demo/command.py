@@ -8,9 +8,7 @@ import textwrap
 
 from greybox.commands.common import add_seed, provenance, say
 
-HELP = (
-    "go once round the loop on a virtual ship: design, sail, estimate, diagnose, extend, redesign"
-)
+HELP = "run the whole loop on a virtual ship: design, sail, estimate, diagnose, extend, redesign"
 EXAMPLES = """examples:
   greybox demo --open
   greybox demo --effect current --seed 3 --out mydemo
@@ -28,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--effect",
         default="thruster_lag",
         metavar="ID",
-        help="what is wrong with the ship that its model lacks: current, thruster_lag, "
+        help="effect on the ship that its model lacks: current, thruster_lag, "
         "input_delay, quadratic_thrust, cubic_damping, lever_arm, heading_bias or waves "
         "(thruster_lag)",
     )

@@ -195,8 +195,8 @@ def _designed(design: Design) -> Step:
     gain = design.efficiency_vs_random
     told = (
         f"A plan of {_SECONDS:.0f} s that keeps surge and sway away from zero"
-        + ("." if gain is None else f": it tells {gain:.2f} times what the best of "
-           f"{design.random_kept} random sequences tells.")
+        + ("." if gain is None else f": it gives {gain:.2f} times the information of the "
+           f"best of {design.random_kept} random sequences.")
     )  # fmt: skip
     return Step(
         "Design the trial",
@@ -212,8 +212,7 @@ def _sailed(trial: Trial) -> Step:
         "",
         (
             f"A virtual ship sails the plan and {len(trial.validation)} s of usual pulses, in "
-            f"continuous time, with noisy sensors. Something is wrong with it that its model "
-            f"does not know.",
+            f"continuous time, with noisy sensors. It has an effect that its model lacks.",
         ),
     )
 
@@ -274,7 +273,7 @@ def truth_sentence(hidden: Sequence[Effect]) -> str:
         + ")"
         for e in hidden
     ]  # fmt: skip
-    return f"What had been hidden: {'; '.join(told)}."
+    return f"The hidden effect was: {'; '.join(told)}."
 
 
 def _diagnosed(diagnosis: Diagnosis, hidden: Sequence[Effect]) -> Step:

@@ -68,7 +68,7 @@ def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
     ]
     budget = diagnosis.budget
     return Page(
-        title="Once round the loop, on a virtual ship",
+        title="The whole loop on a virtual ship",
         headline=headline(diagnosis, demo),
         sentences=[
             "Each step below shows the command that does it; the files that it reads and writes "
@@ -95,9 +95,9 @@ def headline(diagnosis: Diagnosis, demo: Demo) -> str:
     """Return the story in a sentence."""
     ids = [c.id for c in diagnosis.causes]
     hidden = [e.id for e in demo.hidden]
-    asked = f"A ship sailed with {' and '.join(hidden)} hidden in it, which its model lacked"
+    asked = f"A ship sailed with a hidden effect that its model lacked, {' and '.join(hidden)}"
     if ids == hidden:
-        return f"{asked}: the trial was designed, the cause found and named, the model mended."
+        return f"{asked}: the trial was designed, the cause found and named, the model extended."
     return f"{asked}; the verdict of these logs is '{diagnosis.verdict}'" + (
         f", with {', '.join(ids)} named." if ids else "."
     )

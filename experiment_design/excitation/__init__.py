@@ -1,1 +1,1 @@
-"""What moves the ship: sequences of commands, their schedule, and the motion that follows."""
+"""Excitation: sequences of commands, their schedule, and the motion that follows."""

@@ -1,1 +1,1 @@
-"""Whether a trial can be run at all, whether its limits hold, and what to change if not."""
+"""Feasibility of a trial: whether it can be run within its limits, and what to change if not."""

@@ -1,4 +1,4 @@
-"""What a vessel's actuator lag and delay do to a plan that was sought without them."""
+"""The effect of actuator lag and delay on a plan that was designed without them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a plan keeps its limits when the prior model is not exactly true."""
+"""The probability that a plan keeps its limits under the prior's uncertainty."""
 
 from __future__ import annotations
 

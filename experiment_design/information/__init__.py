@@ -1,1 +1,1 @@
-"""What a motion tells of the parameters: information, covariances, and optimality criteria."""
+"""The information of a motion on the parameters, covariances, and optimality criteria."""

@@ -61,7 +61,7 @@ _LEAST_MISFIT = 0.05
 
 @dataclass(frozen=True)
 class Envelope:
-    """How a ship is used, and what a trial has to tell of it.
+    """The operating envelope of a ship, and the predictions that a trial must support.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class Envelope:
     _tau: Array = field(repr=False)
 
     def errors(self, motion: Motion, known: Array | None = None) -> tuple[Array, Array]:
-        """Return what estimates from R motions would leave of the error of predictions.
+        """Return the prediction errors that remain after estimates from R motions.
 
         Parameters
         ----------
@@ -253,7 +253,7 @@ def build_envelope(
     misfit: Array,
     seed: int,
 ) -> Envelope:
-    """Find out how a ship can be used, and what her prior model says of it.
+    """Compute the operating envelope of a ship from her prior model.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a design assumes of the estimator: the information that it would draw from a trial."""
+"""The estimators that a design assumes, by the information that each draws from a trial."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is usually run at sea, by the same criterion: PRBS, multisine, zig-zag, random pulses."""
+"""Classical sequences by the same criterion: PRBS, multisine, zig-zag, random pulses."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class Band:
 
 @dataclass(frozen=True)
 class MotionBand:
-    """What one trial is expected to look like.
+    """The motion that one trial is expected to have.
 
     Parameters
     ----------

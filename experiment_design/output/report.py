@@ -1,4 +1,4 @@
-"""The page of `greybox design`: what the plan is worth, and how it will look."""
+"""The page of `greybox design`: the value of the plan, and the motion to expect."""
 
 from __future__ import annotations
 
@@ -89,14 +89,14 @@ def _next_steps(record: dict[str, Any], between: bool) -> list[NextStep]:
     """Return what to do once the plan has been sailed."""
     vessel = typed(record, "vessel", "V")
     check = NextStep(
-        "Sail the plan, and check its log before you leave the place",
+        "Sail the plan, and check its log before you leave the area",
         f"greybox check LOG --vessel {vessel} --report check.html",
     )
     if between:
         return [
             check,
             NextStep(
-                "See which of the explanations the log bears out",
+                "See which of the explanations the log supports",
                 f"greybox diagnose LOG --vessel {vessel} --report diagnosis.html",
             ),
         ]
@@ -115,7 +115,7 @@ def _sentence(text: str) -> str:
 
 
 def saving(design: Design) -> str:
-    """Return what the plan saves, and how near it is to the best possible."""
+    """Return how much time the plan saves, and how near it is to the best possible."""
     r = design.request
     whole = r.duration * r.trials
     gain = design.efficiency_vs_random
@@ -137,8 +137,8 @@ def saving(design: Design) -> str:
     led = ""
     if design.lead_in_s:
         led = (
-            f" Before it a lead-in of {design.lead_in_s:g} s brings the ship into the regime, "
-            f"which these numbers leave out."
+            f" Before it a lead-in of {design.lead_in_s:g} s brings the ship into the regime; "
+            f"these numbers leave it out."
         )
     return f"{first}; {said}.{led}"
 
@@ -159,8 +159,7 @@ def _trial(design: Design, band: MotionBand) -> Section:
         commands.subplots(count, 1, sharex=True, squeeze=False)[:, 0], design, band.trial, _SIZE
     )
     certain = (
-        "The model is taken as exactly known and nothing else as moving the vessel, so there is "
-        "no band."
+        "The model is assumed to be exact and without process noise, so there is no band."
         if band.certain
         else f"The band holds about 95 % of {band.draws - band.lost} motions, of models drawn from "
         f"the prior{' with process noise' if r.noise.process.any() else ''}"
@@ -303,7 +302,7 @@ def _limits(design: Design) -> Table:
             f"{least:.3g} {unit}",
         ])  # fmt: skip
     return Table(
-        "Limits and how the plan stands to them under the prior model",
+        "How the plan keeps its limits under the prior model",
         [*(["trial"] if several else []), "limit", "bound", "plan"],
         rows,
     )

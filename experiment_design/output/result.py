@@ -1,4 +1,4 @@
-"""What a design is: sequences, what they are worth, and how they stand to the limits."""
+"""The result of a design: sequences, their information, and how they keep the limits."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def run_through(request: PreparedRequest, levels: Array) -> Motion:
 
 @dataclass(frozen=True, repr=False)
 class Design(DisplayMixin):
-    """Sequences for the next trials and what they are worth.
+    """Sequences for the next trials, with their information and limits.
 
     All fields but `parts` speak of the trials behind a lead-in; see `from_first_command`.
 

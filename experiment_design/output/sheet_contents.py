@@ -1,4 +1,4 @@
-"""What the bridge needs to know of one trial, in words and cells: no layout."""
+"""The contents of the trial sheet for the bridge, in words and cells, without layout."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def sheet_contents(
     )
     if legs is not None:
         note = (
-            "Each row is held until what it says has happened; commands move at the rate limit. "
+            "Each row is held until its condition is met; commands move at the rate limit. "
             "Times within a row count from its start. Time in the first column, heading, speed "
             "over ground and position (N, E) are those expected at its start."
         )
@@ -384,7 +384,7 @@ def _abort(design: Design, band: MotionBand) -> tuple[str, ...]:
             text += f"; least expected {signed(least, 2)} m/s"
         if design.lead_in_s:
             text += f"; from {clock(design.lead_in_s)} on, not in the lead-in"
-        said.append(text + ". Not dangerous, but the trial loses its worth.")
+        said.append(text + ". Not dangerous, but the trial loses its value.")
     return tuple(said)
 
 

@@ -87,7 +87,7 @@ def sheet_kind(path: str | Path) -> str:
     kind = Path(path).suffix.lower()
     if kind not in KINDS:
         raise UsageError(
-            f"the sheet '{Path(path).name}' has no ending that it can be written as: use .pdf, "
+            f"the sheet '{Path(path).name}' cannot be written with this ending: use .pdf, "
             f".html, .svg or .png."
         )
     return ".html" if kind == ".htm" else kind

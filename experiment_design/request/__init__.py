@@ -1,1 +1,1 @@
-"""What is asked of a design, and the optimisation problem that follows from it."""
+"""The request for a design, and the optimisation problem that follows from it."""

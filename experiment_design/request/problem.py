@@ -38,7 +38,7 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What one batch of sequences would give.
+    """The evaluation of one batch of sequences.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is asked of a design, as plain data, and the problem that follows from it."""
+"""The request for a design as plain data, and the problem that follows from it."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class CandidateModel:
 
 @dataclass(frozen=True)
 class TrialOptions:
-    """What is decided by the user alone, the same in a request and in its prepared form.
+    """Options that only the user decides, the same in a request and in its prepared form.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ class TrialOptions:
 
 @dataclass(frozen=True)
 class DesignRequest(TrialOptions):
-    """What a user may ask of a design; None where the product is to choose.
+    """The options of a design; None leaves a choice to the program.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""`greybox check`: what is wrong with a log, before any force model."""
+"""`greybox check`: defects of a log, found by kinematics before any force model."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""What sub-commands share: logs, progress, the record of a computation."""
+"""Shared parts of the sub-commands: options, logs, outputs, the record of a computation."""
 
 from __future__ import annotations
 
 import argparse
 import platform
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import file_digest
 from importlib.metadata import version
 from pathlib import Path
@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any
 from greybox.commands.terminal import complain, progress, say
 
 if TYPE_CHECKING:
+    from greybox.report.page import Page
     from greybox.trial.log import TrialLog
     from greybox.vessel.vessel import Vessel
 
 
 __all__ = [
-    "add_cluster", "add_logs", "add_seed", "complain", "count", "positive", "progress",
-    "provenance", "read_logs", "say",
+    "add_cluster", "add_logs", "add_outputs", "add_seed", "complain", "count", "positive",
+    "progress", "provenance", "publish", "read_logs", "say",
 ]  # fmt: skip
 
 # where a command computes changes no result
@@ -39,6 +40,44 @@ def add_logs(parser: argparse.ArgumentParser) -> None:
         "s3://bucket/folder",
     )
     parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
+
+
+def add_outputs(parser: argparse.ArgumentParser, result: str, page: str) -> None:
+    """Add --json and --report, with what they write in words."""
+    parser.add_argument("--json", metavar="F", help=f"write {result} as JSON; - is stdout")
+    parser.add_argument("--report", metavar="HTML", help=f"write a page with {page}")
+
+
+def publish(
+    options: argparse.Namespace,
+    result: Mapping[str, Any],
+    summary: str,
+    page: Callable[[], Page],
+    written: Sequence[str | None] = (),
+) -> None:
+    """Write a result where --json and --report ask for it, and show it on the terminal.
+
+    Parameters
+    ----------
+    result : mapping
+        For JSON.
+    summary : str
+        Shown unless the JSON goes to the terminal, with the files that were `written` before.
+    page : callable
+        Makes the page.
+    """
+    from greybox.files import write_json
+
+    if options.json:
+        write_json(result, options.json)
+    if options.report:
+        from greybox.report.page import write_page
+
+        write_page(page(), options.report)
+    if options.json != "-":
+        say(summary)
+        for path in filter(None, (*written, options.report)):
+            say(f"wrote {path}")
 
 
 def positive(text: str) -> float:
@@ -64,7 +103,7 @@ count.__name__ = "whole number of at least 0"
 def add_seed(parser: argparse.ArgumentParser) -> None:
     """Add --seed."""
     parser.add_argument(
-        "--seed", type=count, default=0, metavar="N", help="seed of whatever is random (0)"
+        "--seed", type=count, default=0, metavar="N", help="seed of the random numbers (0)"
     )
 
 
@@ -73,7 +112,7 @@ def add_cluster(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--cluster",
         metavar="ADDRESS",
-        help="compute on the Dask cluster whose scheduler is there, such as tcp://host:8786; by "
+        help="compute on the Dask cluster of this scheduler, such as tcp://host:8786; by "
         "default that of GREYBOX_CLUSTER, or else this machine",
     )
 
@@ -94,22 +133,25 @@ def read_logs(
     Returns
     -------
     tuple of (list of TrialLog, tuple of str)
-        The segments, and a sentence for each gap and for each file and segment that was left
-        out.
+        The segments, and a sentence for each column that holds another unit, frame or sign
+        than its name, for each gap, and for each file and segment that was left out.
     """
     from greybox.errors import LogError
+    from greybox.trial.checks.check import misnamed_columns
     from greybox.trial.convert.read import read_segments
     from greybox.trial.kinematics import decimate_segments
     from greybox.trial.log_files import find_logs, local_copy
     from greybox.trial.segments import find_log_gaps, join_segments
 
     logs: list[TrialLog] = []
+    misnamed: list[str] = []
     told: list[str] = []
     refused: LogError | None = None
     for file in find_logs(paths):
         try:
             with local_copy(file.path) as path:
                 segments = read_segments(path, vessel, states=states)
+                misnamed += misnamed_columns([path], vessel)
         except LogError as error:
             if not file.found:
                 raise
@@ -121,9 +163,9 @@ def read_logs(
     if refused is not None and not logs:
         raise refused
     if sample_time is None or not logs:
-        return logs, tuple(told)
+        return logs, (*misnamed, *told)
     logs, left_out = decimate_segments(logs, sample_time)
-    return logs, (*told, *left_out)
+    return logs, (*misnamed, *told, *left_out)
 
 
 # options that name files to read, and to write

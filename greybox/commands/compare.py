@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
-from greybox.commands.common import add_seed, provenance, say
+from greybox.commands.common import add_outputs, add_seed, provenance, publish
+
+if TYPE_CHECKING:
+    from greybox.report.page import Page
 
 HELP = "compare free runs of models with logs: fit, errors, bands, plots"
 EXAMPLES = """examples:
@@ -29,8 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="measured",
         help="heading of the run: the log's, or a simulated one (measured)",
     )
-    parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
-    parser.add_argument("--report", metavar="HTML", help="write a page with plots")
+    add_outputs(parser, "the result", "plots")
     parser.add_argument(
         "--no-bands",
         action="store_true",
@@ -41,10 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Read, run, report."""
+    from dataclasses import replace
     from pathlib import Path
 
-    from greybox.files import check_targets, write_json
+    from greybox.files import check_targets
     from greybox.model.model import load_model
+    from greybox.trial.checks.check import misnamed_columns
     from greybox.trial.convert.read import read_log
     from greybox.trial.log_files import find_logs
     from greybox.validation.comparison import compare
@@ -68,17 +73,15 @@ def run(options: argparse.Namespace) -> None:
     comparison = compare(
         named, logs, heading=options.heading, bands=not options.no_bands, seed=options.seed
     )
+    misnamed = (n for m in models for n in misnamed_columns([f.path for f in files], m.vessel))
+    comparison = replace(comparison, notes=tuple(dict.fromkeys(misnamed)))
     record = provenance(options) | {
         "logs": [log.provenance.source + " " + log.provenance.sha256[:12] for log in logs[names[0]]]
     }
-    if options.json:
-        write_json(comparison.to_dict() | {"provenance": record}, options.json)
-    if options.report:
-        from greybox.report.comparison import comparison_page
-        from greybox.report.page import write_page
 
-        write_page(comparison_page(comparison, models, record), options.report)
-    if options.json != "-":
-        say(comparison.summary())
-        if options.report:
-            say(f"wrote {options.report}")
+    def page() -> Page:
+        from greybox.report.comparison import comparison_page
+
+        return comparison_page(comparison, models, record)
+
+    publish(options, comparison.to_dict() | {"provenance": record}, comparison.summary(), page)

@@ -10,8 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from greybox.commands.common import say
-from greybox.registry import entry_points
 
+HELP = "print the script that makes Tab complete commands, options, names and files"
+EXAMPLES = """examples:
+  greybox completion bash
+  greybox completion zsh
+  greybox completion fish
+
+to install it, for this shell only and for those to come:
+"""
 _INSTALL = {
     "bash": ('eval "$(greybox completion bash)"', "greybox completion bash >> ~/.bash_completion"),
     "zsh": ('eval "$(greybox completion zsh)"',
@@ -19,25 +26,10 @@ _INSTALL = {
     "fish": ("greybox completion fish | source",
              "greybox completion fish > ~/.config/fish/completions/greybox.fish"),
 }  # fmt: skip
-HELP = "print the script that makes Tab complete commands, options, names and files"
-EXAMPLES = (
-    "examples:\n"
-    + "".join(f"  greybox completion {shell}\n" for shell in _INSTALL)
-    + "\nto install it, for this shell only and for those to come:\n"
-    + "\n".join(f"  {shell:<8}{now}\n{'':10}{ever}" for shell, (now, ever) in _INSTALL.items())
-)
-# written out, since loading them takes longer than one waits for Tab; tests hold them to the truth
+for _shell, _lines in _INSTALL.items():
+    EXAMPLES += f"  {_shell:<8}{_lines[0]}\n{'':10}{_lines[1]}\n"
+# written out, since each command asks for a vessel and Tab is to answer at once
 VESSELS = ("thesis", "ferry")
-STRUCTURES = ("thesis", "surge", "linear", "blanke", "modulus", "abkowitz", "siso")
-CAUSES = tuple("""
-    current wind thruster_gain thruster_lag input_delay rate_limit feedback_sampling
-    quadratic_thrust advance_speed cubic_damping quadratic_yaw_damping crossflow inertia_coupling
-    side_force asymmetry heading_bias lever_arm angle_offset clock_offset sign parameter_change
-    waves
-""".split())  # fmt: skip
-PARAMETERS = tuple(
-    "Xu Xvr Xuu Wuu Xmu Xkappa Yv Yur Yvv Yvr Wvv Ymu Nr Nuv Nvv Nvr Wuv Nmu".split()
-)
 _FOLDER = ("/",)
 # the files that an argument names, by its metavar: their endings, none where any will do
 _ENDINGS: dict[str | tuple[str, ...] | None, tuple[str, ...]] = {
@@ -45,8 +37,6 @@ _ENDINGS: dict[str | tuple[str, ...] | None, tuple[str, ...]] = {
     ("A", "B"): ("json",), "D": ("json",), "HTML": ("html",), "CSV": ("csv",), "PLAN": ("csv",),
     "F": (), "FILE": (), "DIR": _FOLDER,
 }  # fmt: skip
-# a model has thousands; whoever names a log as one still waits no second for Tab
-MOST_BYTES = 5_000_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,17 +68,23 @@ def offer(parser: argparse.ArgumentParser) -> None:
         def __call__(
             self, *, prefix: str, action: argparse.Action, parsed_args: argparse.Namespace, **_: Any
         ) -> Iterable[str]:
-            found = endings(action)
             if action.dest in ("structure", "compare_structures"):
-                return STRUCTURES
+                from greybox.model.catalogue import structure_names
+
+                return structure_names()
             if action.dest == "causes":
-                return (*CAUSES, *(e.name for e in entry_points(group="greybox.causes")))
+                from greybox.diagnosis.causes import known_causes
+
+                return known_causes()
             if action.dest == "want":
                 return _parameters(parsed_args)
             if str(action.metavar).startswith("NAME="):
                 return [f"{n}=" for n in _parameters(parsed_args)]
-            if found is None or found == _FOLDER:
-                return DirectoriesCompleter()(prefix) if found else ()
+            found = endings(action)
+            if found is None:
+                return ()
+            if found == _FOLDER:
+                return DirectoriesCompleter()(prefix)
             return (*(VESSELS if action.metavar == "V" else ()), *FilesCompleter(found)(prefix))
 
     autocomplete(parser, always_complete_options=False, default_completer=Offered())
@@ -96,8 +92,9 @@ def offer(parser: argparse.ArgumentParser) -> None:
 
 def _parameters(given: argparse.Namespace) -> Iterable[str]:
     """Return the parameters of the model that is named, those of (3.51) where it cannot be read."""
+    from greybox.model.catalogue import get_structure
+
     path = Path(getattr(given, "model", None) or getattr(given, "nominal", None) or "")
     with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
-        if path.stat().st_size <= MOST_BYTES:
-            return tuple(map(str, json.loads(path.read_text(encoding="utf-8"))["names"]))
-    return PARAMETERS
+        return tuple(map(str, json.loads(path.read_text(encoding="utf-8"))["names"]))
+    return get_structure("thesis").parameters

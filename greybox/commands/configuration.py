@@ -65,23 +65,24 @@ def configure(
     for table in (EVERYWHERE, command):
         for key, value in tables.get(table, {}).items():
             parser.place = f"'{name}', [{table}], {key}"
-            if key in known:
-                words[known[key].dest] = _words(known[key], value, parser.place, folder)
-                parser.parse_args(words[known[key].dest])
+            if action := known.get(key):
+                words[action.dest] = _words(action, value, parser.place, folder)
+                parser.parse_args(words[action.dest])
                 continue
             others = sub_parsers(everything()).values() if table == EVERYWHERE else ()
-            names = sorted({*known, *(k for p in others for k in configurable(p))})
+            names = {*known, *(k for p in others for k in configurable(p))}
             if key not in names:
+                near = suggestion(key, sorted(names))
                 raise ConfigurationError(
-                    f"{parser.place}: there is no option '{key}'.{suggestion(key, names)} "
-                    f"Correct the name, or leave it out."
+                    f"{parser.place}: there is no option '{key}'.{near} Correct the name, or "
+                    f"leave it out."
                 )
     parser.place = f"'{name}'"
     parser.parse_args([w for some in words.values() for w in some])
     given = set(typed)
     for group in parser._mutually_exclusive_groups:
-        members = {a.dest for a in group._group_actions}
-        given |= members if members & given else set()
+        if given & (members := {a.dest for a in group._group_actions}):
+            given |= members
     used = [dest for dest in words if dest not in given]
     record = {"file": name, "sha256": digest, "options": used} if used else None
     return [w for dest in used for w in words[dest]], record
@@ -101,12 +102,11 @@ def _read(path: Path) -> tuple[str, str, Mapping[str, Mapping[str, Any]]]:
         raise ConfigurationError(f"cannot read '{name}': {error.strerror}.") from error
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise ConfigurationError(f"'{name}' is not TOML: {error}. Correct that line.") from error
-    for key, table in tables.items():
-        if not isinstance(table, dict):
-            raise ConfigurationError(
-                f"'{name}' gives '{key}' outside a table: put it under [{EVERYWHERE}], or under "
-                f"the command that it is for, such as [estimate]."
-            )
+    for key in (k for k, table in tables.items() if not isinstance(table, dict)):
+        raise ConfigurationError(
+            f"'{name}' gives '{key}' outside a table: put it under [{EVERYWHERE}], or under the "
+            f"command that it is for, such as [estimate]."
+        )
     return name, hashlib.sha256(data).hexdigest(), tables
 
 

@@ -8,16 +8,18 @@ from typing import TYPE_CHECKING, Any
 from greybox.commands.common import (
     add_cluster,
     add_logs,
+    add_outputs,
     add_seed,
     positive,
     provenance,
+    publish,
     read_logs,
-    say,
 )
 from greybox.public import one_thread
 
 if TYPE_CHECKING:
     from greybox.diagnosis.result import Diagnosis
+    from greybox.report.page import Page
     from greybox.trial.log import TrialLog
 
 HELP = "show what the simulation gets wrong, name the cause, extend the model"
@@ -34,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     base.add_argument(
         "--model",
         metavar="MODEL",
-        help="model to diagnose as it is; by default (3.51) in still water and air, estimated on "
-        "the logs, and the terms that the data choose",
+        help="model to diagnose as it is; by default (3.51) in still water and air with the terms "
+        "that the data choose, estimated on the logs",
     )
     parser.add_argument(
         "--validate",
@@ -44,12 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="LOG",
         help="logs that take no part in the fit; by default parts of the logs are held out in turn",
     )
-    parser.add_argument("--json", metavar="F", help="write the diagnosis as JSON; - is stdout")
-    parser.add_argument("--report", metavar="HTML", help="write a page with plots")
+    add_outputs(parser, "the diagnosis", "plots")
     parser.add_argument(
         "--out",
         metavar="MODEL",
-        help="write the extended model; of causes that cannot be told apart, MODEL.<id>.json each",
+        help="write the extended model; where causes cannot be told apart, MODEL.<id>.json for "
+        "each",
     )
     base.add_argument(
         "--structure",
@@ -58,20 +60,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="structure to begin from without --model; its wind terms are left out (thesis)",
     )
     parser.add_argument(
-        "--causes", nargs="+", metavar="ID", help="look for these causes only (all that are known)"
+        "--causes",
+        nargs="+",
+        metavar="ID",
+        help="look for these causes only (by default all known ones)",
     )
     parser.add_argument(
         "--remainder",
         action="store_true",
-        help="add a smooth force without a name to the extended model, zero away from what the "
-        "logs show, where it makes held-out free runs better",
+        help="add a smooth generic force to the extended model where that improves held-out free "
+        "runs; it is zero outside the range of the logs",
     )
     parser.add_argument(
         "--sample-time",
         type=positive,
         metavar="S",
-        help="decimate the logs to this sample time; by default that of MODEL, or what suits the "
-        "ship's pace",
+        help="decimate the logs to this sample time; by default that of MODEL, or one that suits "
+        "the ship's speed",
     )
     add_seed(parser)
     add_cluster(parser)
@@ -83,7 +88,7 @@ def run(options: argparse.Namespace) -> None:
     from dataclasses import replace
 
     from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
-    from greybox.files import check_targets, write_json
+    from greybox.files import check_targets
     from greybox.model.catalogue import get_structure
     from greybox.model.model import load_model
     from greybox.vessel.toml import load_vessel
@@ -111,18 +116,14 @@ def run(options: argparse.Namespace) -> None:
     record = provenance(options) | {"logs": _read(logs), "validate": _read(validate)}
     if options.out:
         _save(diagnosis, options.out, record)
-    if options.json:
-        write_json(diagnosis.to_dict() | {"provenance": record}, options.json)
-    if options.report:
-        from greybox.report.diagnosis import diagnosis_page
-        from greybox.report.page import write_page
 
-        write_page(diagnosis_page(diagnosis, record), options.report)
-    if options.json != "-":
-        say(diagnosis.summary())
-        for path in (options.out, options.report):
-            if path:
-                say(f"wrote {path}")
+    def page() -> Page:
+        from greybox.report.diagnosis import diagnosis_page
+
+        return diagnosis_page(diagnosis, record)
+
+    told = diagnosis.to_dict() | {"provenance": record}
+    publish(options, told, diagnosis.summary(), page, [options.out])
 
 
 def _read(logs: list[TrialLog]) -> list[str]:

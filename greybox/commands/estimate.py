@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any, Literal
 from greybox.commands.common import (
     add_cluster,
     add_logs,
+    add_outputs,
     add_seed,
     positive,
     progress,
     provenance,
+    publish,
     read_logs,
-    say,
 )
 from greybox.estimation.registry import ESTIMATORS
 from greybox.model.predictor_kinds import PREDICTORS
@@ -25,6 +26,7 @@ from greybox.public import one_thread
 MEMORY = 4.0
 
 if TYPE_CHECKING:
+    from greybox.report.page import Page
     from greybox.selection.estimate_stream import StreamEstimate
     from greybox.selection.request import Request
     from greybox.selection.stretches import Drawn
@@ -50,8 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_logs(parser)
     parser.add_argument("--out", metavar="MODEL", help="write the model to this JSON file")
-    parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
-    parser.add_argument("--report", metavar="HTML", help="write a page with plots and all tests")
+    add_outputs(parser, "the result", "plots and all tests")
     add_seed(parser)
     add_cluster(parser)
     _add_model(parser)
@@ -61,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_model(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("what is estimated, and how")
+    group = parser.add_argument_group("model and method")
     group.add_argument(
         "--method",
         choices=tuple(ESTIMATORS),
@@ -85,8 +86,8 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
         type=positive,
         default=EFFORT,
         metavar="SECONDS",
-        help="time for choosing what you leave open [s]; notes name what it did not suffice for, "
-        f"and the first estimate is always completed ({EFFORT:g})",
+        help="time limit for choosing what you leave open [s]; notes name what was not tried "
+        f"within it, and the first estimate is always completed ({EFFORT:g})",
     )
     chosen = group.add_mutually_exclusive_group()
     chosen.add_argument(
@@ -104,8 +105,8 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
         "--covariance",
         choices=("cluster", "ma", "hac", "white", "bootstrap"),
         help="how standard errors are computed: by the spread between segments where that is "
-        "larger (default), for a moving average, for coloured residuals, for white ones, or by a "
-        "block bootstrap",
+        "larger (cluster, the default), for residuals that are a moving average (ma), coloured "
+        "(hac) or white, or by a block bootstrap",
     )
     group.add_argument(
         "--mass", type=positive, metavar="KG", help="mass [kg], for physical coefficients"
@@ -113,7 +114,7 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_data(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("which samples, and how they came about")
+    group = parser.add_argument_group("data")
     group.add_argument(
         "--sample-time",
         type=positive,
@@ -125,16 +126,16 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         type=positive,
         default=MEMORY,
         metavar="GIB",
-        help="logs whose estimate would take more memory than this [GiB] are read in passes, and "
-        f"tests rest on the stretches that tell most ({MEMORY:g})",
+        help="memory limit [GiB]; larger logs are read in passes, and the tests use their most "
+        f"informative stretches ({MEMORY:g})",
     )
     group.add_argument(
         "--validate",
         nargs="+",
         default=[],
         metavar="LOG",
-        help="logs on which the prediction is judged and that take no part in the estimate; by "
-        "default the logs are left out in turn",
+        help="logs that the prediction is judged on and the estimate does not use; by default the "
+        "logs, or parts of them, are left out in turn",
     )
     group.add_argument(
         "--plan",
@@ -158,8 +159,8 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         "--loop",
         choices=("auto", "open", "closed"),
         default="auto",
-        help="whether a controller moved the thrusters; auto: by the vessel file's [closed_loop] "
-        "(auto)",
+        help="whether a controller moved the thrusters (auto: as [closed_loop] of the vessel file "
+        "says)",
     )
     group.add_argument(
         "--heading",
@@ -216,8 +217,8 @@ def _add_output_error(parser: argparse.ArgumentParser) -> None:
         "--weights",
         choices=("noise", "deviation"),
         default="noise",
-        help="unit of the errors: the outputs' noise, or for a model that misfits their standard "
-        "deviation (noise)",
+        help="scale of the errors: the noise of the outputs, or the standard deviation of the "
+        "errors, for a model that fits worse than that (noise)",
     )
     group.add_argument(
         "--shooting",
@@ -243,7 +244,8 @@ def _add_output_error(parser: argparse.ArgumentParser) -> None:
         "--damping",
         choices=("warn", "enforce"),
         default="warn",
-        help="warn of damping terms that would drive the ship, or keep their signs from it (warn)",
+        help="warn of damping terms with a sign that would drive the ship, or enforce the other "
+        "sign (warn)",
     )
 
 
@@ -284,8 +286,8 @@ def _require_heeded(options: argparse.Namespace) -> None:
             # measured is how it is done where nothing is asked for
             if getattr(options, name) not in (parser.get_default(name), "measured"):
                 raise UsageError(
-                    f"--{name.replace('_', '-')} is heeded by --method {' and '.join(methods)} "
-                    f"only, and --method is {options.method}: leave one of them out."
+                    f"--{name.replace('_', '-')} applies to --method {' and '.join(methods)} "
+                    f"only, but --method is {options.method}: leave one of them out."
                 )
 
 
@@ -313,7 +315,7 @@ def _choose(
     if options.structure is not None:
         raise UsageError(
             f"--structure names '{options.structure}' and --compare-structures "
-            f"{len(options.compare_structures)} more: name all that are to be compared there."
+            f"{len(options.compare_structures)} more: name all structures to compare there."
         )
     return compare_structures(
         logs, options.compare_structures, request, progress("structures compared")
@@ -325,7 +327,7 @@ def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
     from greybox.errors import UsageError
     from greybox.estimation.output_error import OutputErrorOptions
-    from greybox.files import check_targets, write_json
+    from greybox.files import check_targets
     from greybox.model.catalogue import get_structure, structure_for
     from greybox.model.model import load_model
     from greybox.report.physical import physical_summary
@@ -416,21 +418,14 @@ def run(options: argparse.Namespace) -> None:
     mass = options.mass if options.mass is not None else vessel.mass
     if options.out:
         model.save(options.out)
-    if options.json:
-        write_json(model.to_dict(), options.json)
-    if options.report:
+    summaries = [estimate.summary()]
+    summaries += [choice.summary()] if choice else []
+    summaries += [physical_summary(model, mass)] if mass is not None else []
+
+    def page() -> Page:
         from greybox.report.estimation import estimation_page
-        from greybox.report.page import write_page
         from greybox.selection.prediction import as_read
 
-        page = estimation_page(estimate, as_read(logs, estimate), made, choice=choice, mass=mass)
-        write_page(page, options.report)
-    if options.json != "-":
-        say(estimate.summary())
-        if choice:
-            say("\n" + choice.summary())
-        if mass is not None:
-            say("\n" + physical_summary(model, mass))
-        for path in (options.out, options.report):
-            if path:
-                say(f"\nwrote {path}")
+        return estimation_page(estimate, as_read(logs, estimate), made, choice=choice, mass=mass)
+
+    publish(options, model.to_dict(), "\n\n".join(summaries), page, [options.out])

@@ -1,4 +1,4 @@
-"""`greybox export`: the model where it is used."""
+"""`greybox export`: a model as C, FMU, CasADi, MATLAB or flat JSON."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Read the model, write the files, tell the ports."""
+    """Read the model, write the files, show the ports."""
     from greybox.export.export import export_model
     from greybox.files import check_targets
     from greybox.model.model import load_model

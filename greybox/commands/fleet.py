@@ -3,10 +3,22 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
-from greybox.commands.common import add_cluster, add_seed, progress, provenance, say
+from greybox.commands.common import (
+    add_cluster,
+    add_outputs,
+    add_seed,
+    progress,
+    provenance,
+    publish,
+)
 
-HELP = "estimate many ships of one class: what they share, which one differs, what changes in time"
+if TYPE_CHECKING:
+    from greybox.report.page import Page
+
+HELP = "estimate many ships of one class: what they share, which ship differs, what changes over "
+"time"
 EXAMPLES = """examples:
   greybox fleet ferries --out ferries.csv --report ferries.html
   greybox fleet ferries --json ferries.json --cluster tcp://host:8786
@@ -17,14 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "fleet", metavar="DIR",
-        help="folder with one folder a ship, each with a vessel file (*.toml) and logs (CSV, "
-        "Parquet), in order of time by their dates or names",
+        help="folder with one sub-folder per ship, each with a vessel file (*.toml) and logs "
+        "(CSV, Parquet) in the order of their dates or names",
     )  # fmt: skip
-    parser.add_argument("--json", metavar="F", help="write the result as JSON; - is stdout")
     parser.add_argument(
         "--out", metavar="CSV", help="write a table with a row for each coefficient of each ship"
     )
-    parser.add_argument("--report", metavar="HTML", help="write a page with plots")
+    add_outputs(parser, "the result", "plots")
     add_cluster(parser)
     add_seed(parser)
 
@@ -46,8 +57,8 @@ def _require_outside(options: argparse.Namespace) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Estimate, pool, tell."""
-    from greybox.files import check_targets, sha256, write_json
+    """Estimate, pool, report."""
+    from greybox.files import check_targets, sha256, write_text
     from greybox.fleet.fleet import estimate_fleet
     from greybox.fleet.ships import fleet_files
 
@@ -59,18 +70,12 @@ def run(options: argparse.Namespace) -> None:
     if options.out:
         import pandas as pd
 
-        from greybox.files import write_text
-
         write_text(pd.DataFrame(fleet.rows()).to_csv(index=False), options.out)
-    if options.json:
-        write_json(fleet.to_dict() | {"provenance": record}, options.json)
-    if options.report:
-        from greybox.report.fleet import fleet_page
-        from greybox.report.page import write_page
 
-        write_page(fleet_page(fleet, record), options.report)
-    if options.json != "-":
-        say(fleet.summary())
-        for path in (options.out, options.report):
-            if path:
-                say(f"\nwrote {path}")
+    def page() -> Page:
+        from greybox.report.fleet import fleet_page
+
+        return fleet_page(fleet, record)
+
+    told = fleet.to_dict() | {"provenance": record}
+    publish(options, told, fleet.summary(), page, [options.out])

@@ -10,7 +10,7 @@ from greybox.commands.common import positive, provenance, say
 if TYPE_CHECKING:
     from greybox.trial.convert.options import ImportOptions
 
-HELP = "make logs of raw files: CSV, Parquet, NMEA 0183, MATLAB, ROS bags, MCAP"
+HELP = "convert raw files to logs: CSV, Parquet, NMEA 0183, MATLAB, ROS bags, MCAP"
 EXAMPLES = """examples:
   greybox import trial.nmea --vessel ship.toml --out trial.csv
   greybox import gnss.nmea thrusters.csv --vessel ship.toml --sample-time 0.5 --out trial.parquet
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "raw",
         nargs="+",
         metavar="RAW",
-        help="raw files of one trial, or where --out is a folder of a trial each",
+        help="raw files of one trial; where --out is a folder, each file is a trial",
     )
     parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
     parser.add_argument(
@@ -44,14 +44,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sample-time",
         type=positive,
         metavar="S",
-        help="sample time of the log [s]; that of the slowest motion sensor by default",
+        help="sample time of the log [s]; by default that of the slowest motion sensor",
     )
     parser.add_argument(
         "--hole",
         type=positive,
         metavar="S",
-        help="longest time without samples that is bridged [s], a longer one is a gap; 2.5 usual "
-        "steps of the sensor by default",
+        help="longest time without samples that is interpolated [s], longer ones are gaps; by "
+        "default 2.5 usual steps of the sensor",
     )
     parser.add_argument(
         "--fix", action="store_true", help="mend what greybox check finds, where that is safe"
@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="ID",
-        help="leave this finding as it is although --fix would mend it (repeat)",
+        help="leave this finding as it is although --fix would mend it (may be repeated)",
     )
     parser.add_argument(
         "--velocities",
@@ -89,33 +89,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="CHANNEL=S",
         help="smooth this channel by local polynomials over a window [s], before anything is "
-        "derived from it; nothing is smoothed by default (repeat)",
+        "derived from it; by default nothing is smoothed (may be repeated)",
     )
     parser.add_argument(
         "--reference-height",
         type=positive,
         metavar="M",
-        help="bring the wind to this height [m] by the power law 1/7; as measured by default",
+        help="convert the wind to this height [m] by the 1/7 power law; by default as measured",
     )
     parser.add_argument(
         "--origin",
         metavar="LAT,LON",
-        help="where x_n = y_n = 0 [deg]; the first position by default",
+        help="latitude and longitude of x_n = y_n = 0 [deg]; by default the first position",
     )
     parser.add_argument(
         "--topic",
         action="append",
         default=[],
         metavar="TOPIC[=NAME]",
-        help="topic of a bag to use, and the name of its signal or field=name,... (repeat)",
+        help="topic of a bag to use, and the name of its signal or field=name,... (may be "
+        "repeated)",
     )
     parser.add_argument(
         "--note",
         action="append",
         default=[],
         metavar="KEY=TEXT",
-        help="a condition of the trial (draught, trim, loading, water_depth, sea_state), or a note "
-        "in words (repeat)",
+        help="a condition of the trial (draught, trim, loading, water_depth, sea_state), or a "
+        "note in words (may be repeated)",
     )
     parser.add_argument("--json", metavar="F", help="write the record as JSON; - is stdout")
 

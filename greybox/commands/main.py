@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -30,7 +31,8 @@ EXAMPLES = """examples:
   greybox diagnose trial.csv --vessel ship.toml --model model.json
 
 'greybox help COMMAND' shows the options and examples of one command. Options that you
-repeat may stand in greybox.toml; NO_COLOR, GREYBOX_CONFIG and GREYBOX_CLUSTER are heeded.
+use often may stand in greybox.toml. Environment variables: NO_COLOR, GREYBOX_CONFIG,
+GREYBOX_CLUSTER.
 """
 _log = logging.getLogger(__name__)
 
@@ -39,9 +41,9 @@ def _add_shell(parser: argparse._ActionsContainer, verbose: str) -> None:
     """Add what every command takes, before or after its name."""
     parser.add_argument(
         "-v", "--verbose", action="count", dest=verbose, default=argparse.SUPPRESS,
-        help="tell on stderr what is read, chosen and solved, and when; -vv tells more",
+        help="report on stderr what is read, chosen and solved, with times; -vv reports more",
     )  # fmt: skip
-    told = "show no results and no progress, errors only; files are written as always"
+    told = "show errors only; files are written as usual"
     for names, text in ((("-q", "--quiet"), told), (("--no-config",), "read no greybox.toml")):
         parser.add_argument(*names, action="store_true", default=argparse.SUPPRESS, help=text)
 
@@ -68,7 +70,7 @@ def build_parser(only: str | None = None) -> Parser:
         sub = commands.add_parser(name, **told)
         module.add_arguments(sub)
         sub.usage = sub.short_usage()
-        _add_shell(sub.add_argument_group("what is shown, and what is read"), "more_verbose")
+        _add_shell(sub.add_argument_group("output and configuration"), "more_verbose")
         sub.set_defaults(run=module.run)
     topic = commands.add_parser("help", help="show the help of a command", add_help=False)
     topic.add_argument("topic", nargs="?", choices=known, metavar="COMMAND")
@@ -136,15 +138,10 @@ def _run(options: argparse.Namespace) -> None:
     if used := options.configuration:
         _log.info("configuration %s gives %s", used["file"], ", ".join(used["options"]))
     require_apart(options)
-    if hasattr(options, "cluster"):
-        from greybox.numerics.parallel import on_cluster
+    with ExitStack() as stack:
+        if hasattr(options, "cluster"):
+            from greybox.numerics.parallel import on_cluster
 
-        with on_cluster(options.cluster):
-            options.run(options)
-    else:
+            stack.enter_context(on_cluster(options.cluster))
         options.run(options)
     _log.info("done")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

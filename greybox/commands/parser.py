@@ -1,4 +1,4 @@
-"""The parser of the command line: one sentence for what is mistyped, with the nearest name."""
+"""The parser of the command line: one sentence for a mistake, with the nearest name."""
 
 from __future__ import annotations
 
@@ -13,9 +13,15 @@ from rich_argparse import RawDescriptionRichHelpFormatter, RichHelpFormatter
 from greybox.commands.terminal import complain
 from greybox.errors import ConfigurationError, suggestion
 
-_CHOICE = re.compile(r"invalid choice: (['\"])(?P<typed>.*)\1 \(choose from (?P<known>.*)\)$")
-_VALUE = re.compile(r"invalid (?P<kind>.*) value: (['\"])(?P<typed>.*)\2$")
-_BOTH = re.compile(r"argument (?P<one>\S+): not allowed with argument (?P<other>\S+)$")
+# the messages of argparse, and what is said in their place
+_SENTENCES = {
+    r"argument (\S+): not allowed with argument (\S+)$":
+        r"\2 and \1 exclude one another: keep one of them",
+    r"invalid (.*) value: ('.*'|\".*\")$": r"\2 is no \1",
+    "is no float$": "is no number",
+    "is no int$": "is no whole number",
+    r"unrecognized arguments: ([^- ]\S*).*": r"'\1' is one argument too many",
+}  # fmt: skip
 
 
 class Formatter(RawDescriptionRichHelpFormatter):
@@ -63,26 +69,21 @@ class Parser(argparse.ArgumentParser):
             action.default = argparse.SUPPRESS if action.option_strings else None
         return copy
 
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in (known := list(action.choices)):
+            name = str(argparse._get_action_name(action))
+            self.error(
+                f"{name.lower() if name.isupper() else name} '{value}' is not known."
+                f"{suggestion(value, known)} Known: {', '.join(known)}"
+            )
+
     def error(self, message: str) -> NoReturn:
         """Exit with status 2 and one sentence, or raise one about the configuration file."""
-        unknown = message.removeprefix("unrecognized arguments: ")
-        if found := _CHOICE.search(message):
-            known = found["known"].replace("'", "").split(", ")
-            what = message[: found.start()].removeprefix("argument ").rstrip(": ")
-            what = what.lower() if what.isupper() else what
-            near = suggestion(found["typed"], known)
-            message = f"{what} '{found['typed']}' is not known.{near} Known: {', '.join(known)}"
-        elif found := _VALUE.search(message):
-            kind = {"int": "whole number", "float": "number"}.get(found["kind"], found["kind"])
-            message = f"{message[: found.start()]}'{found['typed']}' is no {kind}"
-        elif found := _BOTH.search(message):
-            message = f"{found['other']} and {found['one']} exclude one another: keep one of them"
-        elif unknown != message:
-            option = re.split("[ =]", unknown)[0]
-            message = f"'{option}' is one argument too many"
-            if option.startswith("-"):
-                near = suggestion(option, self._option_string_actions)
-                message = f"there is no option '{option}'.{near}"
+        for pattern, sentence in _SENTENCES.items():
+            message = re.sub(pattern, sentence, message)
+        if found := re.match("unrecognized arguments: ([^ =]*)", message):
+            near = suggestion(found[1], self._option_string_actions)
+            message = f"there is no option '{found[1]}'.{near}"
         message += "." * (not message.endswith((".", "?")))
         if self.place:
             raise ConfigurationError(f"{self.place}: {re.sub('^argument [^:]*: ', '', message)}")

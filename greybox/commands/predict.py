@@ -5,10 +5,20 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from greybox.commands.common import add_seed, count, positive, progress, provenance, read_logs, say
+from greybox.commands.common import (
+    add_outputs,
+    add_seed,
+    count,
+    positive,
+    progress,
+    provenance,
+    publish,
+    read_logs,
+)
 
 if TYPE_CHECKING:
     from greybox.prediction.result import ManoeuvrePrediction
+    from greybox.report.page import Page
     from greybox.trial.log import TrialLog
 
 HELP = "predict standard manoeuvres, with intervals and the IMO limits"
@@ -30,13 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("turning", "zigzag", "stopping", "crash"),
         help="stopping: with the thrust taken off; crash: with full astern",
     )
-    parser.add_argument("--json", metavar="F", help="write the quantities as JSON; - is stdout")
-    parser.add_argument("--report", metavar="HTML", help="write a page with tracks and histories")
+    add_outputs(parser, "the quantities", "tracks and histories")
     parser.add_argument(
         "--out",
         metavar="CSV",
-        help="write the run that the intervals are about as a log; several runs become a file "
-        "each, with side and angle in its name",
+        help="write the run of the estimate itself as a log; of several runs each has a file, "
+        "named by side and angle",
     )
     how = parser.add_argument_group("manoeuvre")
     how.add_argument(
@@ -52,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--share",
         type=float,
         metavar="S",
-        help="for a ship that propeller speeds steer: share of the approach's speed by which the "
+        help="for a ship steered by propeller speeds: share of the approach's speed by which the "
         "two sides differ from it (0.5), or share of a tunnel thruster's highest speed (1)",
     )
     how.add_argument(
@@ -91,19 +100,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--course", type=float, default=0.0, metavar="DEG", help="heading of the approach [deg] (0)"
     )
     approach.add_argument(
-        "--current", action="store_true", help="keep the model's current; still water otherwise"
+        "--current",
+        action="store_true",
+        help="predict in the model's current; by default in still water",
     )
     approach.add_argument(
         "--no-limits",
         action="store_true",
-        help="leave the vessel file's ranges of the commands, but keep its rates",
+        help="ignore the vessel file's ranges of the commands, but keep its rates",
     )
     other = parser.add_argument_group("intervals and trial")
     other.add_argument("--trial", metavar="LOG", help="compare with the same manoeuvres in a log")
     other.add_argument(
         "--disturbed",
         action="store_true",
-        help="add the model's process noise, so that the intervals hold a single trial",
+        help="add the model's process noise, so that the intervals cover a single trial",
     )
     other.add_argument(
         "--scale",
@@ -123,7 +134,7 @@ def run(options: argparse.Namespace) -> None:
     import math
     from dataclasses import replace
 
-    from greybox.files import check_targets, write_json
+    from greybox.files import check_targets
     from greybox.model.model import load_model
     from greybox.prediction.predict import predict_manoeuvre
 
@@ -158,21 +169,14 @@ def run(options: argparse.Namespace) -> None:
     )
     made = replace(made, notes=(*told, *made.notes))
     record = provenance(options)
-    written = []
-    if options.out:
-        written += _write_runs(made, options.out)
-    if options.json:
-        write_json(made.to_dict() | {"provenance": record}, options.json)
-    if options.report:
-        from greybox.report.page import write_page
+    written = _write_runs(made, options.out) if options.out else []
+
+    def page() -> Page:
         from greybox.report.prediction import prediction_page
 
-        write_page(prediction_page(made, record), options.report)
-        written.append(options.report)
-    if options.json != "-":
-        say(made.summary())
-        for name in written:
-            say(f"wrote {name}")
+        return prediction_page(made, record)
+
+    publish(options, made.to_dict() | {"provenance": record}, made.summary(), page, written)
 
 
 def _angle(text: str) -> float | tuple[float, float]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from greybox.commands.common import add_cluster, add_seed, positive, progress, provenance, say
 
-HELP = "repeat the studies of the thesis, of the estimators' efficiency, of the diagnosis' power"
+HELP = "repeat the studies of the thesis, of the estimators' efficiency and of the diagnosis' power"
 EXAMPLES = """examples:
   greybox reproduce chapter4 --out chapter4
   greybox reproduce chapter6 --runs 500 --out chapter6
@@ -35,7 +35,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--validate", nargs="+", metavar="LOG", help="chapter 7: validation logs")
     parser.add_argument("--vessel", metavar="V", help="chapter 7: vessel file of those logs")
     parser.add_argument(
-        "--sample-time", type=positive, metavar="S", help="chapter 7: decimate to this [s]"
+        "--sample-time",
+        type=positive,
+        metavar="S",
+        help="chapter 7: decimate to this sample time [s]",
     )
     parser.add_argument("--structure", metavar="NAME", help="chapter 7: structure (thesis)")
     parser.add_argument(

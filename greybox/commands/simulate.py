@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-bands",
         action="store_true",
-        help="leave out the limits between which the motion lies with 95 %% probability",
+        help="leave out the band that holds the motion with 95 %% probability",
     )
     add_seed(parser)
 

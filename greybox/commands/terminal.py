@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 LOGGERS = ("greybox", "experiment_design")
 _QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
-# words of a verdict in red and green, and all others in yellow
-_TONES = {31: "do not trust|poor|unexplained", 32: "(?!trust except)trust|good|none",
-          33: r"trust except|\w+"}  # fmt: skip
+_VERDICT = r"(?m)^((?:[Vv]erdict|Prediction|Coefficients): )(do not trust|trust except|\w+)"
+# red and green; other verdicts are yellow
+_TONES = {"do not trust": 31, "poor": 31, "unexplained": 31, "trust": 32, "good": 32, "none": 32}
 # the bar that is on the screen: one at most
 _shown: list[Progress] = []
 
@@ -50,9 +50,8 @@ def say(text: str) -> None:
         return
     clear()
     if coloured(sys.stdout):
-        for tone, words in _TONES.items():
-            verdict = rf"(?m)^((?:[Vv]erdict|Prediction|Coefficients): )({words})\b"
-            text = re.sub(verdict, f"\\1\x1b[1;{tone}m\\2\x1b[0m", text)
+        tone = "{}\x1b[1;{}m{}\x1b[0m".format
+        text = re.sub(_VERDICT, lambda m: tone(m[1], _TONES.get(m[2], 33), m[2]), text)
     sys.stdout.write(text + "\n")
 
 
@@ -62,36 +61,33 @@ def clear() -> None:
         _shown.pop().stop()
 
 
-def _bar(counted: bool) -> Progress:
-    from rich import progress as rich
-    from rich.console import Console
-
-    text = rich.TextColumn("{task.description}", markup=False)
-    left = (rich.BarColumn(), rich.TimeRemainingColumn(), "left")
-    # steps may take minutes, so the time left is told by all of them
-    bar = rich.Progress(
-        rich.SpinnerColumn(), text, *(left if counted else [rich.TimeElapsedColumn()]),
-        console=Console(stderr=True), transient=True, speed_estimate_period=float("inf"),
-        redirect_stdout=False, redirect_stderr=False,
-    )  # fmt: skip
-    bar.add_task("", total=None)
-    bar.start()
-    return bar
-
-
 def _show(text: str, done: int = 0, total: int | None = None) -> None:
     """Show what is being done: of some steps how many, with the time that is left."""
     if _QUIET.get() or not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
         return
     counting = bool(_shown) and _shown[0].tasks[0].total is not None
-    if total is not None and (done >= total or not counting):
+    if done == total or (total is not None and not counting):
         clear()
     # steps that are counted stay on the screen while parts of one are told
-    if done < total if total is not None else not counting:
-        if not _shown:
-            _shown.append(_bar(total is not None))
-        (task,), text = _shown[0].task_ids, _printable(text)
-        _shown[0].update(task, description=text, completed=done, total=total, refresh=True)
+    if done == total or (total is None and counting):
+        return
+    if not _shown:
+        from rich import progress as rich
+        from rich.console import Console
+
+        what = rich.TextColumn("{task.description}", markup=False)
+        left = (rich.BarColumn(), rich.TimeRemainingColumn(), "left")
+        # steps may take minutes, so the time left is told by all of them
+        bar = rich.Progress(
+            rich.SpinnerColumn(), what, *(left if total else [rich.TimeElapsedColumn()]),
+            console=Console(stderr=True), transient=True, speed_estimate_period=float("inf"),
+            redirect_stdout=False, redirect_stderr=False,
+        )  # fmt: skip
+        bar.add_task("")
+        bar.start()
+        _shown.append(bar)
+    task = _shown[0].task_ids[0]
+    _shown[0].update(task, description=_printable(text), completed=done, total=total, refresh=True)
 
 
 def progress(title: str) -> Callable[[int, int], None]:

@@ -1,4 +1,4 @@
-"""Causes that are known to act: the model with them, whether or not they prove themselves."""
+"""Estimates with causes that the user knows to be present, whether or not the logs confirm them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The black-box part of an extended model: a smooth force for which no term stands.
+"""The black-box part of an extended model: a smooth force that no term of the structure describes.
 
 In each equation it is a sum of bumps of the signals that the equation's own terms see: the
 velocities through the water, the yaw rate, and the thrusters' forces. Each is a product over
@@ -208,7 +208,7 @@ def _reason(found: Remainder, fall: float) -> str:
             f"would be worse."
         )
     if fall > _LEAST:
-        return f"{what} is not added: no state's held-out free run surely gains by it."
+        return f"{what} is not added: it improves the held-out free run of no state significantly."
     how = f"fall by {100 * fall:.2g} %" if fall > 0 else f"grow by {-100 * fall:.2g} %"
     return (
         f"{what} is not added: the squared errors of held-out free runs {how} with it (mean of "

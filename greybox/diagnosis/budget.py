@@ -1,4 +1,4 @@
-"""The error budget: which share of the squared error of a held-out free run is whose.
+"""The error budget: the squared error of held-out free runs, split among its sources.
 
 A cause takes what switching it off at sea would: the extended model says what the logs would show
 without it, the model without causes is fitted to that anew, and its held-out error is compared with
@@ -41,7 +41,7 @@ Drop = Callable[[Problem, Point], Point]
 
 @dataclass(frozen=True)
 class SwitchedOff:
-    """What would be held out if the ship had everything but one cause.
+    """Held-out logs as they would be if the ship had everything but one cause.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""From a search to what the user gets: causes, groups, the extended model, its gain."""
+"""Turn a finished search into a diagnosis: causes, groups, the extended model, its gain."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ Array = NDArray[np.float64]
 
 
 class DiagnosisBuilder:
-    """Turns a search into what the user gets."""
+    """Turns a finished search into a diagnosis."""
 
     def __init__(
         self,
@@ -285,9 +285,9 @@ class DiagnosisBuilder:
     def where(self, validate: Sequence[TrialLog]) -> str:
         """Say what is held out."""
         if validate:
-            return f"on {', '.join(log.name for log in validate)}, which took no part in the fit"
+            return f"on {', '.join(log.name for log in validate)}, which were not used in the fit"
         return (
-            f"on {FOLDS} parts of the logs, each predicted by a fit to the others, for no "
+            f"on {FOLDS} parts of the logs, each predicted by a fit to the others, because no "
             f"validation log was given"
         )
 
@@ -295,8 +295,8 @@ class DiagnosisBuilder:
         out = list(self.notes)
         if self.given is not None:
             out.append(
-                "the model is judged as it was given, which is 'before'; beside a cause its "
-                "coefficients are estimated anew, so that a cause is what they cannot mend."
+                "'before' is the model as it was given; with a cause its coefficients are "
+                "estimated again, so a cause is only what other coefficients cannot explain."
             )
         turned = backwards(self.found.final, self.case.universe.parameters)
         if turned:
@@ -306,9 +306,9 @@ class DiagnosisBuilder:
             )
         if any(self.found.final.point.ship.sensors.lever):
             out.append(
-                "the gain is that of the log as its sensors show it: compare carries the log to "
-                "the origin, which puts the noise of the yaw rate, times the lever arm, into u "
-                "and v."
+                "the gain is measured on the log as its sensors show it; greybox compare moves "
+                "the velocities to the origin, which adds the noise of the yaw rate, times the "
+                "lever arm, to u and v."
             )
         for change in after.changes:
             out.append(f"the extended model tells the log's own clock: {change.sentence}.")
@@ -384,8 +384,8 @@ def _symptoms(problem: Problem, found: Search) -> tuple[Symptom, ...]:
     if not told and found.causes:
         told = [
             Symptom(
-                "at no sample are the errors larger than the noise of the sensors; only all "
-                "samples together show them",
+                "at single samples the errors are no larger than the sensors' noise; they show "
+                "only over all samples together",
                 "", 0.0,
             )
         ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""From a fitted hypothesis to an ordinary model, with the causes inside."""
+"""Turn a fitted hypothesis into an ordinary model that contains the causes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The colour of free-run errors, and its removal.
+"""Models of coloured free-run errors, and whitening by them.
 
 Between sensor noise, which a sample forgets, and what moves the ship beside the model,
 which the ship and the disturbance remember, the error of a free run has a state-space

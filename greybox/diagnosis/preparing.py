@@ -1,4 +1,4 @@
-"""What a diagnosis begins with: logs long enough and mended, a structure, and its causes."""
+"""Preparation of a diagnosis: repaired logs of sufficient length, a structure, its causes."""
 
 from __future__ import annotations
 

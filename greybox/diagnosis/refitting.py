@@ -1,4 +1,4 @@
-"""Fits with one more cause: begun, begun again where slow errors hold them, and final_refit."""
+"""Fits with one more cause, started again where slow errors hold them back, and the final one."""
 
 from __future__ import annotations
 

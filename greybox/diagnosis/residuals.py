@@ -1,4 +1,4 @@
-"""What kind of errors a free run leaves: white or not, tied to the inputs or not."""
+"""Tests of the errors of a free run: white or coloured, related to the inputs or not."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 class DiagnosisVerdict(StrEnum):
-    """What a diagnosis ends with; equal to the words that its JSON holds."""
+    """The verdict of a diagnosis; equal to the word in its JSON."""
 
     NAMED = "named"
     PARTLY = "partly"
@@ -31,8 +31,8 @@ class DiagnosisVerdict(StrEnum):
 
 
 _SAID = {
-    DiagnosisVerdict.NAMED: "what is wrong has a name",
-    DiagnosisVerdict.PARTLY: "a part of what is wrong has a name",
+    DiagnosisVerdict.NAMED: "the cause is named",
+    DiagnosisVerdict.PARTLY: "named causes explain a part of what is wrong",
     DiagnosisVerdict.NONE: "nothing is wrong beyond noise",
     DiagnosisVerdict.CONFUSED: "something is wrong, and several causes explain it equally well",
     DiagnosisVerdict.UNEXPLAINED: "something is wrong, and no known cause explains it",
@@ -284,7 +284,7 @@ class Diagnosis(DisplayMixin):
     wrong : tuple of Symptom
         Largest first.
     partial : tuple of Found
-        Causes that help, and do no more than a force without a name would.
+        Causes that help, and do no more than a generic force would.
     candidates : tuple of Found
         Members of the groups, each as it would be by itself.
     base, model : ManoeuvringModel
@@ -352,13 +352,13 @@ class Diagnosis(DisplayMixin):
             return f"{told} {self.remaining}"
         if self.verdict == DiagnosisVerdict.CONFUSED:
             return (
-                f"Something is wrong, and these logs cannot tell which it is: "
+                f"Something is wrong, and these logs cannot tell which cause it is: "
                 f"{' or '.join(self.groups[0])}."
             )
         if self.verdict == DiagnosisVerdict.NONE and self.wrong:
             return (
-                "Nothing is wrong that would repeat: what moves the ship beside the model does not "
-                "come back in the held-out logs."
+                "Nothing is wrong that repeats: the errors of the free run do not recur in the "
+                "held-out logs."
             )
         return f"{_SAID[self.verdict][0].upper()}{_SAID[self.verdict][1:]}."
 
@@ -392,7 +392,7 @@ class Diagnosis(DisplayMixin):
         lines += [f"  {s.sentence}" for s in self.wrong] or ["  nothing beyond noise"]
         lines += [f"  {t.sentence}" for t in self.residuals.get("before", ()) if not t.passed]
         for title, causes in (
-            ("Causes", self.causes), ("Helps no more than a force without a name", self.partial),
+            ("Causes", self.causes), ("No better than a generic force", self.partial),
             ("Each would explain it", self.candidates),
         ):  # fmt: skip
             if causes:
@@ -491,7 +491,7 @@ def _budget_lines(budget: Sequence[BudgetPart]) -> list[str]:
     head = "".join(f"{s:>24}" for s in states)
     return [
         "",
-        "Whose the squared held-out error is [%], before mending (95 %):",
+        "Sources of the squared held-out error [%], before the model is extended (95 %):",
         f"  {'':<22}{head}",
         *(f"  {p.part:<22}" + "".join(f"{_share(p, s):>24}" for s in states) for p in shown),
     ]

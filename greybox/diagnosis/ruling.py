@@ -1,4 +1,4 @@
-"""The ruling on what a search found, and on what it left."""
+"""The verdict on a search: what it found, and what remains."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def rule(
     known: Sequence[Found],
     gain: Mapping[str, Gain],
 ) -> Ruling:
-    """Decide what may be said.
+    """Decide the verdict.
 
     Parameters
     ----------
@@ -106,7 +106,8 @@ def rule(
     if not (why or stand or known) and final is not found.base:
         taken = 1 - np.exp(held_out(final.integrator).worse(final, found.base))
         why = (
-            f"terms of motion and commands that no cause stands for lower the squared error of the "
+            f"terms of motion and commands that belong to no known cause lower the squared error "
+            f"of the "
             f"held-out runs by {100 * taken:.0f} %"
         )
     named = tuple(c for c in stand if not _grouped(c, groups))
@@ -144,21 +145,21 @@ def _wrong(
     numbers = sum(nu.size for pair in pairs for nu in pair.held_fit.nu)
     if left.proof.p_value < SURE and left.gain > max(WORTH * numbers, LEFT_OVER * explained):
         return (
-            f"forces that no cause stands for would explain another "
+            f"forces that belong to no known cause would explain another "
             f"{100 * left.explicable:.1f} % of the squared errors of logs that they were not "
             f"fitted to (p = {left.proof.p_value:.1g})"
         )
     other = disagreement(pairs)
     if other.p_value < APART and other.fall > RELEVANT * numbers + BESIDE * explained:
-        return "the coefficients that these logs ask for do not hold for the held-out ones"
+        return "the coefficients that fit these logs do not fit the held-out ones"
     before, after = _excess(base, final), _excess(final, final)
     # a cause that leaves much of the error where it was is not what is wrong, or not alone
     if found and after > LARGE and after > MOST_OF * before:
         return f"the causes leave {100 * after / before:.0f} % of the squared error"
     if not found and before > LARGE and _drifts(pairs):
         return (
-            f"a force moves the ship in all logs that is remembered for longer than gusts "
-            f"({GUST:g} s): a current that changes, or something that no cause stands for"
+            f"in all logs a force moves the ship that lasts longer than gusts "
+            f"({GUST:g} s): a current that changes, or an effect that belongs to no known cause"
         )
     return _no_prediction(pairs)
 
@@ -183,8 +184,8 @@ def _other_coefficients(given: Sequence[Pair], anew: Sequence[Pair]) -> str:
     if proof.p_value > APART or fall < WORTH:
         return ""
     return (
-        f"estimated anew, the coefficients of the model lower the squared error of the held-out "
-        f"logs by {100 * fall:.0f} %: those that it was given do not hold here"
+        f"estimating the coefficients of the model again lowers the squared error of the held-out "
+        f"logs by {100 * fall:.0f} %: the given ones do not hold here"
     )
 
 
@@ -272,17 +273,18 @@ def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> st
         return f"What is left is not only noise: {why}.{tail}"
     if left.proof.p_value < SURE and left.explicable > 0:
         return (
-            f"What is left is hardly more than noise: forces that no cause stands for would "
+            f"What is left is hardly more than noise: forces that belong to no known cause would "
             f"explain another {100 * left.explicable:.1f} % of the squared errors "
             f"(p = {left.proof.p_value:.1g}), too little to matter.{tail}"
         )
-    return f"What is left is not told from noise.{tail}"
+    return f"What is left cannot be told from noise.{tail}"
 
 
 def _next(verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]]) -> list[str]:
     out = [
-        f"design a trial that tells {' from '.join(ids)}: greybox design "
-        f"--between {' '.join(f'MODEL.{file_word(i)}.json' for i in ids[:2])}"
+        f"design a trial that tells {' from '.join(ids)}: greybox design --vessel V "
+        f"--between {' '.join(f'MODEL.{file_word(i)}.json' for i in ids[:2])} --duration 900 "
+        f"--out plan.csv"
         for ids in ([c.hypothesis.id for c in pair] for pair in groups)
     ]
     if verdict in (DiagnosisVerdict.UNEXPLAINED, DiagnosisVerdict.PARTLY):
@@ -293,7 +295,8 @@ def _next(verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]]) -> l
     if verdict in (DiagnosisVerdict.NAMED, DiagnosisVerdict.PARTLY):
         out.append(
             "design the next trial with the extended model, so that its least certain "
-            "coefficients move: greybox design --model MODEL"
+            "coefficients move: greybox design --vessel V --model MODEL --duration 900 "
+            "--out plan.csv"
         )
     if verdict is DiagnosisVerdict.NONE:
         out.append("the model may be used as it is; a trial in other conditions would tell more")

@@ -1,4 +1,4 @@
-"""What every cause could explain of the errors, judged at once without refitting.
+"""Scores: what each cause could explain of the errors, computed together without refitting.
 
 The sensitivity of the free run to a cause, less what the coefficients and the start can
 imitate, is what its error would look like. How much of the squared innovations lies
@@ -34,7 +34,7 @@ _LEAST_FACTOR, _MOST_FACTOR = 0.3, 3.0
 
 @dataclass(frozen=True)
 class Score:
-    """What a cause promises.
+    """The improvement that a cause promises before it is fitted.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The search for causes: score all, refit the best, take the likeliest that proves itself.
+"""The search for causes: score all, refit the best, keep the likeliest that held-out logs confirm.
 
 Forward steps with a backward check; a cause counts only when it is significant after
 correction for all that were tried, and when it predicts logs that it was not fitted to.
@@ -148,7 +148,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Search:
-    """What a search went through and where it ended.
+    """The steps of a search and its result.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def search(
     alone: bool = True,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Search:
-    """Look for causes until none proves itself any more.
+    """Look for causes until held-out logs confirm no further one.
 
     One that is not alone, after which the terms that the data choose may go on, looks for what
     past commands do only, once forces of motion and commands are left that a cause did not take.

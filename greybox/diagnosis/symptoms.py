@@ -1,4 +1,4 @@
-"""What a simulation gets wrong: where, when and under which conditions, in sentences."""
+"""Symptoms: where, when and under which conditions a simulation errs, in sentences."""
 
 from __future__ import annotations
 
@@ -134,4 +134,4 @@ def coloured(fit: Fit, outputs: Sequence[str]) -> str | None:
             found.append(f"{word(outputs[group.outputs[0]])}{tail}")
     if not found:
         return None
-    return f"something beside the model moves {', '.join(found)}"
+    return f"something that the model lacks moves {', '.join(found)}"

@@ -1,4 +1,4 @@
-"""Every threshold that a diagnosis rules by: what it stands for, and the run that set it.
+"""Every threshold of a diagnosis: what it stands for, and the run that set it.
 
 Those of the numerics (steps, iterations, scales) stand beside the code that they serve.
 "Blind" are the virtual trials of ``greybox.study.blind``, "foreign" ships whose simulators share

@@ -1,4 +1,4 @@
-"""Narrow-band motion in the innovations: waves, which no force of the model answers for."""
+"""Narrow-band motion in the innovations: waves, which no force of the model explains."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small noise model of the residuals, so that their variance under sums is known well.
+"""A noise model of the residuals of low order, which gives the variance of their sums.
 
 The equation error of (4.3) is nearly a difference of measurement noise: what a
 slow instrument sums of it almost cancels, and sample autocovariances miss the

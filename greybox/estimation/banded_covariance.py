@@ -1,4 +1,4 @@
-"""The covariance of the equation error, and what makes that error white.
+"""The covariance of the equation error, and its whitening.
 
 To first order the error of (4.3) is
 
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ErrorNoise:
-    """Levels of everything that an equation error consists of.
+    """Noise levels of all parts of an equation error.
 
     Parameters
     ----------

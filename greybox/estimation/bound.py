@@ -1,4 +1,4 @@
-"""The least covariance that instruments can reach at a model and given noises."""
+"""The lower bound on the covariance of instrumental-variable estimates of a model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a controller moved the thrusters, so that inputs depend on the noise (A4)."""
+"""Detection of a closed loop, where a controller makes inputs depend on the noise (A4)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CLOSED_LOOP_LAG = 2
 
 
 def closed_loop_share(logs: Sequence[TrialLog]) -> float | None:
-    """Return the share of samples that the logs mark as controlled, None if none tells."""
+    """Return the share of samples that the logs mark as controlled, None if no log marks any."""
     known = [log for log in logs if log.loop_known]
     if not known:
         return None

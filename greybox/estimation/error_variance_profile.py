@@ -1,4 +1,4 @@
-"""How the variance of an equation error, and its tie to the sample before, change along a log.
+"""How the variance of an equation error, and its covariance at lag one, change along a log.
 
 To first order the error of (4.3) is e(k+1) − A(k) e(k) − S(k) n(k) with the slopes A, S of
 the next state in what is measured. Where A is near one, what a slow instrument sums of it
@@ -27,7 +27,7 @@ _SHARES = (1e-7, 1e2)
 
 
 class ErrorVarianceProfile:
-    """One equation's error on one log, as far as measurement noise makes it.
+    """The part of one equation's error on one log that measurement noise causes.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def error_variance_profiles(
     residuals: Sequence[Sequence[Array]],
     keep: Sequence[NDArray[np.bool_]],
 ) -> tuple[tuple[ErrorVarianceProfile, ...], ...]:
-    """Return the shape of each equation's error on each log; empty where none is told.
+    """Return the variance profile of each equation's error on each log; empty where none is known.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Runs that an observer with one gain draws towards the log: nearly linear in the parameters."""
+"""Runs that an observer of one gain corrects towards the log, nearly linear in the parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the errors of a free run say: their memory, and whether they wander.
+"""Tests of free-run errors: their memory, and slow drifts.
 
 All channels of a run share the parameters, so its scores are summed over channels;
 and a fit bends towards slow errors, which therefore hide in its residuals.

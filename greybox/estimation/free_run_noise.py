@@ -1,4 +1,4 @@
-"""How much moves a ship beside the model that a free run was fitted with."""
+"""The process noise of a model that was fitted by free runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LEAST = 1e-9
 
 
 def residual_noise(runs: FreeRuns, p: Array, nodes: Array, loss: Loss) -> FreeRuns:
-    """Return the runs weighed by what they leave, whatever they were fitted with."""
+    """Return the runs weighted by their own residuals, whatever weights they were fitted with."""
     r, _, _ = runs.value(p, nodes)
     return runs.with_sigma(noise_of(r, runs.sigma, runs.segments.use, loss, _LEAST * runs.sigma))
 

@@ -96,7 +96,7 @@ def restriction_matrix(
             matrix[i, list(names).index(name)] = weight
         if not matrix[i].any():
             raise UsageError(
-                f"the restriction '{told[i]}' says nothing of a parameter: write it as "
+                f"the restriction '{told[i]}' names no parameter: write it as "
                 f"'{names[0]} = 0.1'. Parameters: {', '.join(names)}."
             )
         values[i] = value

@@ -1,4 +1,4 @@
-"""What logs can tell: how far the heading turns, which signs and commands they hold."""
+"""The information in logs: range of headings, signs of the velocities, movement of commands."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def unexcited(structure: Structure, lost: Sequence[str], why: str) -> str:
 
 
 def is_noise(logs: Sequence[TrialLog], name: str, share: float) -> bool:
-    """Whether an input of this share (`movements`) is but the noise of commands that cancel."""
+    """Whether an input of this share (`movements`) is only the noise of commands that cancel."""
     values = [log.forces((name,)).ravel() for log in logs]
     size = float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
     return share < _STEADY and size < _WHITE * (white_noise(values) or 0.0)
@@ -118,7 +118,7 @@ def is_noise(logs: Sequence[TrialLog], name: str, share: float) -> bool:
 def require_informative(
     logs: Sequence[TrialLog], predictor: PredictorKind, structure: Structure
 ) -> None:
-    """Refuse logs that cannot answer, before any algebra does so obscurely.
+    """Refuse logs that do not determine the parameters, before the algebra fails obscurely.
 
     Raises
     ------
@@ -140,8 +140,9 @@ def require_informative(
         )
     if all(float(np.ptp(log[s])) == 0.0 for log in logs for s in structure.states):
         raise ExcitationError(
-            f"{', '.join(structure.states)} do not change over the whole log, so no motion tells "
-            f"what the commands do: see whether the columns hold what was measured (greybox "
+            f"{', '.join(structure.states)} do not change over the whole log, so the motion does "
+            f"not show what the commands do: see whether the columns hold what was measured "
+            f"(greybox "
             f"check), and give a log in which the ship moves."
         )
     if structure.marine:

@@ -39,7 +39,7 @@ _NEXT_TO_NONE = 1e-12
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """Levels, and which of them were sought.
+    """Noise levels, and which of them were estimated.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class NoiseFit:
 
 
 def on_stretches(keep: Sequence[NDArray[np.bool_]]) -> Sequence[NDArray[np.bool_]]:
-    """Return the rows that the levels are sought on: all, or stretches all along long logs.
+    """Return the rows that the levels are estimated from: all, or stretches spread along long logs.
 
     Parameters
     ----------
@@ -315,7 +315,7 @@ def first_levels(likelihood: ErrorLikelihood, stated: Array, further: Array) -> 
 
 
 def fit_noise(likelihood: ErrorLikelihood, start: NoiseFit) -> NoiseFit:
-    """Find the levels, and decide what the errors say beyond the first ones.
+    """Estimate the levels, and decide which of them the errors support beyond the first ones.
 
     The process noise has a memory where that explains the errors better, and
     stated sensors are given up where the errors contradict them (p = 0.001 each).
@@ -342,7 +342,7 @@ def fit_noise(likelihood: ErrorLikelihood, start: NoiseFit) -> NoiseFit:
 def stated_levels(
     vessel: Vessel, states: Sequence[str], further: Sequence[str]
 ) -> tuple[Array, Array]:
-    """Return what the vessel file says of its sensors, nan and 0 where it is silent."""
+    """Return the sensor noise that the vessel file states, nan and 0 where it states none."""
     measured = [vessel.std(s) for s in states]
     rest = [vessel.std("psi" if n == "psi" else "wind") or 0.0 for n in further]
     return np.array([np.nan if v is None else v for v in measured]), np.array(rest)

@@ -120,7 +120,7 @@ def _solved(stacked: Array, target: Array, size: Array) -> Solution:
 
 @dataclass(frozen=True)
 class Sums:
-    """All that samples tell of one equation, in a size that does not grow with them.
+    """Sufficient statistics of one equation, of a size that does not grow with the samples.
 
     The triangle of a QR decomposition holds every sum of squares and products, and never
     squares what it adds, so that regressors which are nearly one lose no digits.

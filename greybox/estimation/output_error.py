@@ -678,7 +678,8 @@ def _slow_tests(slow: Mapping[str, tuple[float, float]]) -> tuple[TestResult, ..
     out = []
     for name, (z, p) in slow.items():
         found = (
-            "wanders more than a fit to white noise would: something beside the model moves the "
+            "wanders more than a fit to white noise would: something that the model lacks moves "
+            "the "
             "ship; the standard errors allow for it, and --process-noise estimates with it."
             if p <= _WANDERS
             else "shows no slow part beyond noise."
@@ -686,7 +687,7 @@ def _slow_tests(slow: Mapping[str, tuple[float, float]]) -> tuple[TestResult, ..
         out.append(
             TestResult(
                 "slow_errors",
-                f"the free-run error of {name} is white: nothing beside the model moves it",
+                f"the free-run error of {name} is white: nothing that the model lacks moves it",
                 z,
                 p,
                 f"the free-run error of {name} {found}",

@@ -1,4 +1,4 @@
-"""What output error simulates: the columns, the unknown means, and the signals of a log."""
+"""The simulation that output error fits: columns, unknown means, and signals of a log."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def output_model(
 
 
 def measured(model: OutputModel, log: TrialLog) -> Measured:
-    """Return what a log gives to a fit of `model`.
+    """Return the data of a log for a fit of `model`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a model's free run is good for on logs that took no part, as values.
+"""How well a model's free run predicts held-out logs, as values.
 
 The numbers come from `greybox.validation.judge_prediction`; here they are weighed
 against limits, and sentences are rendered from them.
@@ -25,7 +25,7 @@ def channel_words(channel: str) -> str:
 
 
 class PredictionLevel(StrEnum):
-    """What a free run is good for; the values are the words that users read."""
+    """How well a free run predicts; the values are the words that users read."""
 
     GOOD = "good"
     LIMITED = "limited"
@@ -83,7 +83,7 @@ class PredictionLimits:
 
 LIMITS = PredictionLimits()
 # why parts were not left out where seconds were few
-TOO_SHORT = "time was too short to estimate without a part: give it more with --effort"
+TOO_SHORT = "time was too short to estimate without a part: allow more with --effort"
 
 
 @dataclass(frozen=True)
@@ -251,9 +251,9 @@ class Elsewhere(Reason):
     def sentence(self) -> str:
         """What was left out, and how far the error went."""
         if self.kinds:
-            what = f"a kind of manoeuvre that its estimate never saw ({', '.join(self.kinds)})"
+            what = f"a kind of manoeuvre that the estimate did not use ({', '.join(self.kinds)})"
         else:
-            what = f"{'a log' if self.whole else 'parts of the log'} that its estimate never saw"
+            what = f"{'a log' if self.whole else 'parts of the log'} that the estimate did not use"
         if self.diverged:
             far = f"its free run diverges in {self.diverged} of {self.count} runs"
         else:
@@ -262,7 +262,7 @@ class Elsewhere(Reason):
                 f"the error of {channel_words(worst)} is {100 * self.errors[worst]:.0f} % of its "
                 f"spread"
             )
-        return f"on {what}, each left out in turn, {far}: give it logs of what it is to predict"
+        return f"on {what}, each left out in turn, {far}: add logs of the motion to be predicted"
 
 
 @dataclass(frozen=True)
@@ -333,7 +333,7 @@ class LargeError(Reason):
             return f"{who} is worse than a constant {when}"
         return (
             f"the error of {who} is {100 * self.error:.0f} % of its spread "
-            f"(at most {100 * self.limit:.0f} asked)"
+            f"({100 * self.limit:.0f} % is allowed)"
         )
 
 
@@ -362,7 +362,7 @@ class NarrowBands(Reason):
         return (
             f"the 95 % bands of {channel_words(self.channel)} hold {100 * self.share:.0f} % "
             f"({100 * self.interval[0]:.0f}-{100 * self.interval[1]:.0f}) of the measurements "
-            f"(at least {100 * self.limit:.0f} asked)"
+            f"({100 * self.limit:.0f} % is required)"
         )
 
 
@@ -390,7 +390,7 @@ class NothingHeldOut(Reason):
 
 @dataclass(frozen=True)
 class NotRefitted(Reason):
-    """Some parts could not be left out: the others do not do for an estimate, or time was short.
+    """Some parts could not be left out: the rest does not give an estimate, or time was short.
 
     Parameters
     ----------
@@ -415,8 +415,8 @@ class NotRefitted(Reason):
         if not self.in_time:
             return f"{self.parts} of {self.count} parts were not judged: {TOO_SHORT}"
         return (
-            f"{self.parts} of {self.count} parts were not judged: without them the logs do not do "
-            f"for an estimate ({self.because.rstrip('.')})"
+            f"{self.parts} of {self.count} parts were not judged: without them the logs do not "
+            f"suffice for an estimate ({self.because.rstrip('.')})"
         )
 
 
@@ -429,7 +429,7 @@ class NothingMoved(Reason):
     @property
     def sentence(self) -> str:
         """What was seen."""
-        return "no channel moved beyond its noise, so its prediction was not put to the test"
+        return "no channel moved beyond its noise, so its prediction was not tested"
 
 
 @dataclass(frozen=True)
@@ -561,7 +561,7 @@ class PredictionVerdict(DisplayMixin):
         return (
             f"the error of {', '.join(c.words for c in self.channels if c.moves)} is at most "
             f"{100 * max(c.error for c in self.channels if c.moves):.0f} % of the spread "
-            f"({100 * self.limits.good:.0f} asked)"
+            f"({100 * self.limits.good:.0f} % is allowed)"
         )
 
     @property
@@ -583,8 +583,8 @@ class PredictionVerdict(DisplayMixin):
         return {
             JudgedOn.HELD_OUT: f"{self.parts} parts of the log{'s' * several}, each left out of "
             f"an estimate in turn",
-            JudgedOn.VALIDATION: f"{len(self.logs)} log{'s' * (len(self.logs) != 1)} that took no "
-            f"part in the estimate",
+            JudgedOn.VALIDATION: f"{len(self.logs)} log{'s' * (len(self.logs) != 1)} that the "
+            f"estimate did not use",
             JudgedOn.OWN: f"the log{'s' * several} of the estimate",
         }[self.judged_on]
 

@@ -1,4 +1,4 @@
-"""What an estimator is given: logs, structure, predictor and what is asked of the estimate."""
+"""The input of an estimator: logs, structure, predictor and options."""
 
 from __future__ import annotations
 

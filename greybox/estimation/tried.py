@@ -108,7 +108,7 @@ class Comparison(DisplayMixin):
             if self.chosen is None
             else f"{self.chosen.label} (thrust ~ {self.chosen.thrust})"
         )
-        return f"{taken} was taken: {self.rule}."
+        return f"{taken} was chosen: {self.rule}."
 
     @property
     def ordered(self) -> list[TriedModel]:
@@ -133,11 +133,11 @@ class Comparison(DisplayMixin):
 
     def table(self) -> tuple[list[str], list[list[str]]]:
         """Return the header and rows, as cells of a table."""
-        head = ["structure", "taken", "terms", "method", "predictor", "thrust ~", "step [s]",
+        head = ["structure", "chosen", "terms", "method", "predictor", "thrust ~", "step [s]",
                 "integrator", "commands", "score [%]", "behind", "std error", ""]  # fmt: skip
         return head, [
             [
-                r.structure, "taken" if r.chosen else "", str(r.terms), r.method, r.predictor,
+                r.structure, "chosen" if r.chosen else "", str(r.terms), r.method, r.predictor,
                 r.thrust, f"{r.sample_time:g}", r.integrator, r.commands,
                 *("–" if v is None else f"{v:.1f}" for v in (r.score, r.behind, r.se)),
                 r.note,

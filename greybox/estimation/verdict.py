@@ -361,7 +361,7 @@ class NoRegression(Reason):
 
 @dataclass(frozen=True)
 class FailedTest(Reason):
-    """A test speaks against the parameters that it names, or tells of the iteration.
+    """A failed test, with the parameters that it concerns or the state of the iteration.
 
     Parameters
     ----------

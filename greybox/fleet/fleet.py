@@ -68,7 +68,7 @@ class ClassModel:
         return (
             f"structure '{self.structure}' by {self.method} with predictor '{self.predictor}' at "
             f"{self.sample_time:g} s, as the data of {len(self.chosen_by)} of {len(self.asked)} "
-            f"ships that were asked prefer ({', '.join(self.chosen_by)})."
+            f"ships that were examined prefer ({', '.join(self.chosen_by)})."
         )
 
 

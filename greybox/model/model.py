@@ -165,7 +165,7 @@ class ManoeuvringModel(DisplayMixin):
         )
 
     def coefficient_model(self) -> ManoeuvringModel:
-        """Return the model whose coefficients mean what their names say, as far as any does.
+        """Return the model whose coefficients may be interpreted.
 
         It is this one, unless its file holds a second estimate beside the one that predicts.
         """

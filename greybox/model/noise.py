@@ -1,4 +1,4 @@
-"""How noisy measurements are, and how much moves a ship beside its model."""
+"""Noise levels of the measurements and of the motion."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class NoiseLevels(DisplayMixin):
 
 @dataclass(frozen=True)
 class BandCalibration:
-    """How far free runs were off on logs that took no part, beside what draws of them say.
+    """The errors of free runs on held-out logs, relative to the spread of their draws.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is simulated and compared with the sensors, from what, and with which unknowns.
+"""The output model: simulated quantities, their inputs and unknowns.
 
 States z are those of the structure and, where it is simulated, the heading; the
 outputs are the measured states, and the heading and the velocity through the
@@ -20,7 +20,7 @@ Role = Literal["input", "output"]
 
 @dataclass(frozen=True)
 class OutputModel:
-    """What is simulated, from what, and with which unknowns.
+    """The simulated quantities, their inputs and unknowns.
 
     Parameters
     ----------

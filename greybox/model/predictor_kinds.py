@@ -10,7 +10,7 @@ from greybox.registry import Registry
 
 @dataclass(frozen=True)
 class PredictorKind:
-    """What a predictor does about current and wind.
+    """How a predictor treats current and wind.
 
     Parameters
     ----------

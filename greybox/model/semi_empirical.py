@@ -1,4 +1,4 @@
-"""A first model of a ship of which no trial is known, from its main dimensions.
+"""A first model of a ship without trials, from its main dimensions.
 
 Forces and moments are those of published semi-empirical formulas, each named where it is used;
 they are brought to the parameters of (3.51) by Table 3.1 with the inertias
@@ -97,7 +97,7 @@ _SPREAD_RUDDER = 0.3
 
 @dataclass(frozen=True)
 class MainDimensions:
-    """What the formulas need of a ship.
+    """The main dimensions that the formulas need.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ def require_time() -> None:
         The limit is over.
     """
     if seconds_left() <= 0:
-        raise OutOfTimeError("its time was over; give it more with --effort.")
+        raise OutOfTimeError("time ran out; allow more with --effort.")
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What is asked of a prediction, and the manoeuvres that it comes to for a vessel."""
+"""The request for a prediction, and the manoeuvres that follow from it for a vessel."""
 
 from __future__ import annotations
 

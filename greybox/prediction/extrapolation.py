@@ -1,4 +1,4 @@
-"""Where a predicted run leaves what the model was estimated on."""
+"""Where a predicted run leaves the range that the model was estimated on."""
 
 from __future__ import annotations
 

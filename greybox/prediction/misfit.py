@@ -1,4 +1,4 @@
-"""Forces that a structure lacks, as large as its runs on logs that took no part say."""
+"""Forces that a structure lacks, of the size that its errors on held-out logs show."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _STATIONARY = 8.0
 
 @dataclass(frozen=True)
 class HeldOutErrors:
-    """What free runs on logs that took no part miss.
+    """Errors of free runs on held-out logs.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a reader of a prediction has to know, one sentence each."""
+"""Notes on a prediction, one sentence each."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def run_notes(
     if unheld:
         told.append(
             f"{unheld} of {total + unheld} draws do not hold the approach speed within the limits "
-            f"of the commands and were left out: intervals are too narrow by them."
+            f"of the commands and were left out, so the intervals are too narrow."
         )
     diverged = int(runs.diverged[1:].sum())
     if diverged:
@@ -57,14 +57,14 @@ def run_notes(
     short = int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum())
     if runs.complete[0] < 0:
         told.append(
-            f"the estimate itself does not complete the manoeuvre within {longest:.3g} s: what it "
-            f"does not reach is said so."
+            f"the estimate itself does not complete the manoeuvre within {longest:.3g} s: "
+            f"quantities that it does not reach are marked."
         )
     if short:
         worst = min((v for v in values.values() if v is not None), key=lambda v: v.reached)
         told.append(
             f"{short} of {total} draws do not complete the manoeuvre within {longest:.3g} s; "
-            f"intervals are of those that reach the quantity, {worst.reached} at least."
+            f"intervals are of the draws that reach the quantity, {worst.reached} at least."
         )
     if kind in ("turning", "zigzag"):
         names = [n for n, s in zip(helm.columns, helm.steer, strict=True) if s != 0]
@@ -171,7 +171,7 @@ def trial_notes(
         told.append(
             f"sailed in the wind of the trial, {wind:.2g} m/s in the mean."
             if windy
-            else f"the trial had {wind:.2g} m/s of mean wind, of which the model knows nothing."
+            else f"the trial had {wind:.2g} m/s of mean wind, which the model does not include."
         )
     if current is not None:
         told.append(current.sentence)

@@ -71,8 +71,8 @@ Progress = Callable[[int, int], None]
 # times of one ship length after which a manoeuvre that is not complete stays so
 _LONGEST = 200.0
 _UNSIZED = (
-    "pushed as hard as the model missed other logs, all draws diverge: its forces beyond the "
-    "parameters' errors are in no interval. Estimate on logs of such motion."
+    "with the force errors that held-out logs show, all draws diverge, so the intervals leave "
+    "these errors out: estimate on logs of such motion."
 )
 # steps of process noise drawn at once
 _STEPS = 1024

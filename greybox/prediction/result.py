@@ -1,4 +1,4 @@
-"""What a predicted manoeuvre is: quantities with intervals, verdicts, and the runs behind them."""
+"""Predicted manoeuvres: quantities with intervals, verdicts, and the runs behind them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is kept of the runs: that of the estimate as a log, all of them for pictures."""
+"""Storage of the runs: that of the estimate as a log, all of them for pictures."""
 
 from __future__ import annotations
 

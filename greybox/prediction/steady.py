@@ -250,6 +250,12 @@ def _crossing(x: Array, y: Array) -> float | None:
     return float(x[k] - y[k] * (x[k + 1] - x[k]) / (y[k + 1] - y[k]))
 
 
+def kept_from_straight(helm: Helm) -> list[int]:
+    """Return which commands have limits that forbid to steer straight ahead."""
+    outside = helm.outside(np.zeros(len(helm.columns))) & (helm.drive == 0)
+    return [int(i) for i in np.flatnonzero(outside)]
+
+
 def require_straight(helm: Helm) -> None:
     """Refuse limits that forbid to steer straight ahead.
 
@@ -258,9 +264,7 @@ def require_straight(helm: Helm) -> None:
     UsageError
         The command and its limits are named.
     """
-    straight = np.zeros(len(helm.columns))
-    outside = helm.outside(straight) & (helm.drive == 0)
-    for i in np.flatnonzero(outside):
+    for i in kept_from_straight(helm):
         limit = helm.limits[i]
         raise UsageError(
             f"the approach needs {helm.columns[i]} at 0, and the vessel file keeps it from "

@@ -410,7 +410,7 @@ def compare(
 
 def _sentence(model: ManoeuvringModel, log: TrialLog, rows: list[Compared], length: float) -> str:
     if not rows:
-        return f"'{log.name}' holds nothing of this manoeuvre that could be compared."
+        return f"'{log.name}' holds no part of this manoeuvre that could be compared."
     off = [r for r in rows if not r.agrees]
     known = [str(entry.get("sha256", "")) for entry in model.record.get("logs", ())]
     own = log.provenance.sha256

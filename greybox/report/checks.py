@@ -84,7 +84,8 @@ _TIE = (
     "and below mended, with their root mean square disagreement over the log."
 )
 _DOUBT = (
-    " The velocities of the whole log come no closer by this repair: judge it before you apply it."
+    " This repair brings the velocities of the whole log no closer together: judge it before you "
+    "apply it."
 )
 
 
@@ -135,7 +136,7 @@ def check_page(
         "the water is allowed for"
     )
     page = Page(
-        title="What is wrong with the log" if len(reports) == 1 else "What is wrong with the logs",
+        title="Check of the log" if len(reports) == 1 else "Check of the logs",
         headline=headline(reports),
         sections=sections,
         lead=lead,
@@ -152,7 +153,7 @@ def headline(reports: Sequence[CheckReport]) -> str:
     if not found:
         open_ids = sorted({o.id for r in reports for o in r.outcomes if o.status == "cannot tell"})
         vague = f"; nothing can be said of {', '.join(open_ids)}" if open_ids else ""
-        return f"No findings in {logs}{vague}."
+        return f"Nothing wrong was found in {logs}{vague}."
     report = reports[_gravest(reports)]
     finding = min(report.findings, key=_seriousness)
     several = {f.key for f in shared_findings(reports)}
@@ -303,7 +304,7 @@ def _section(
             continue
         figure, doubt = _drawn(f, report, vessel)
         if len(f.logs) > 1 and shown[f.key] != report.name and not doubt:
-            sentences.append(f"{f.line}; drawn for {shown[f.key]}, with which it is shared.")
+            sentences.append(f"{f.line}; drawn for {shown[f.key]}, where it was found, too.")
             continue
         svg = to_svg(figure, f"log{number}finding{k}")
         pictures.append(Picture(svg, f"{said}{doubt}", f"{alternative(f)}{doubt}"))

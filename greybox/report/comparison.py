@@ -27,10 +27,12 @@ def headline(comparison: Comparison) -> str:
     fits, best = comparison.fits(), _best(comparison)
     shown = ", ".join(f"{_NAMES.get(s, s)} {v:.0f} %" for s, v in fits[best].items())
     count = len(comparison.runs[0])
-    logs = f"{count} log" + ("s" if count > 1 else "")
-    if len(fits) == 1:
-        return f"The free run of {comparison.names[0]} fits {logs}: {shown} (100 is perfect)."
-    return f"{comparison.names[best]} fits {logs} best: {shown} (free run, 100 is perfect)."
+    logs = f"the {count} logs" if count > 1 else "the log"
+    most = " best" if len(fits) > 1 else ""
+    return (
+        f"The free run of model '{comparison.names[best]}' fits {logs}{most}: {shown} "
+        f"(100 is perfect)."
+    )
 
 
 def _best(comparison: Comparison) -> int:
@@ -108,6 +110,7 @@ def comparison_page(
         title="Measured against simulated",
         headline=headline(comparison),
         sentences=[
+            *comparison.notes,
             *[t.sentence for t in tests],
             *[
                 f"{name}: {d.sentence}"

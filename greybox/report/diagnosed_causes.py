@@ -20,8 +20,9 @@ def cause_section(diagnosis: Diagnosis) -> Section:
     """Show why: causes, their numbers, groups that look alike, and the search."""
     told = {
         DiagnosisVerdict.NAMED: "",
-        DiagnosisVerdict.PARTLY: "These stand, and something remains.",
-        DiagnosisVerdict.NONE: f"{diagnosis.tried} causes were tried; none of them proved itself.",
+        DiagnosisVerdict.PARTLY: "These causes are confirmed, and an error beyond noise remains.",
+        DiagnosisVerdict.NONE: f"{diagnosis.tried} causes were tried; held-out logs "
+        "confirm none of them.",
         DiagnosisVerdict.CONFUSED: "Each of these explains the logs about as well as the others. "
         "A model with the wrong one fits these logs, and may fail on the next.",
         DiagnosisVerdict.UNEXPLAINED: f"None of the {diagnosis.tried} causes that were tried "
@@ -29,7 +30,7 @@ def cause_section(diagnosis: Diagnosis) -> Section:
     }[diagnosis.verdict]
     if diagnosis.partial:
         helping = ", ".join(c.key for c in diagnosis.partial)
-        told = f"{told} No more than a force without a name would help: {helping}.".strip()
+        told = f"{told} No better than a generic force would be: {helping}.".strip()
     found = _all_found(diagnosis)
     points = [f"{_called(c)}: {c.evidence}." for c in found]
     return Section(
@@ -94,8 +95,8 @@ def _groups(diagnosis: Diagnosis) -> Iterator[str]:
     known = known_causes()
     for group in diagnosis.groups:
         yield (
-            f"These logs cannot tell {' from '.join(group)}. A trial tells them apart where what "
-            f"they look like differs most; greybox design --between plans it."
+            f"These logs cannot tell {' from '.join(group)}. A trial in which their effects "
+            f"differ most tells them apart; greybox design --between plans it."
         )
         for member in group:
             cause = known.get(member.partition(":")[0])
@@ -113,9 +114,9 @@ def _ranking(diagnosis: Diagnosis, kept: Sequence[str]) -> Iterator[Picture]:
             f" The other {len(step) - len(shown)} are not drawn." if len(step) > len(shown) else ""
         )
         caption = (
-            f"Step {i + 1} of the search: fall of −2 log L that each cause's sensitivity "
-            f"promised, that its refit gained, and that held-out logs confirm (95 % interval). "
-            f"Bold: what the verdict names.{more}"
+            f"Step {i + 1} of the search: fall of −2 log L of each cause as its sensitivity "
+            f"predicts it, as a refit finds it, and as held-out logs confirm it (95 % interval). "
+            f"Bold: the causes that the verdict names.{more}"
         )
         gain = "was not refitted" if best.gain is None else f"gained {best.gain:.0f}"
         alternative = (

@@ -96,7 +96,7 @@ def _summary(diagnosis: Diagnosis) -> list[str]:
             f"{_NAMES.get(s, s)} from {_percent(g.before)} to {_percent(g.after)}"
             for s, g in diagnosis.gain.items()
         )
-        told.append(f"The fit of the free run (100 % is perfect) goes: {gains}.")
+        told.append(f"The fit of the free run (100 % is perfect) changes: {gains}.")
     if diagnosis.budget:
         told.append(noise_sentence(diagnosis.budget, diagnosis.gain))
     return told
@@ -165,8 +165,8 @@ def _budget(diagnosis: Diagnosis) -> Iterator[Picture]:
     """Yield whose the squared error is."""
     if diagnosis.budget:
         caption = (
-            "Whose the squared error of the held-out free run is, before what was found is mended "
-            "and after: of a cause, how much less it would be if the ship did not have it."
+            "Sources of the squared error of the held-out free run, before and after the model is "
+            "extended; the part of a cause is how much smaller the error would be without it."
         )
         if cut_off(diagnosis.budget):
             caption += " Shares beyond the picture's edge stand in the table of the budget."

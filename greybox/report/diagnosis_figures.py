@@ -287,7 +287,7 @@ def ranked_for_picture(step: Sequence[Ranked], kept: Sequence[str]) -> list[Rank
 
 
 def ranking_figure(step: Sequence[Ranked], kept: Sequence[str]) -> Figure:
-    """Draw what each cause promised, gained, and proved at one step of the search.
+    """Draw the predicted, fitted and held-out gain of each cause at one step of the search.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The error budget on a page: whose the squared error is, before mending and after."""
+"""The error budget on a page: sources of the squared error, before and after the extension."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
         ax.barh(places, share, 0.72, color=BLUE, edgecolor="0.2", linewidth=0.6, label="before")
         ax.barh(
             places, [100 * p.after[state] for p in budget], 0.3, color=ORANGE, edgecolor="0.2",
-            linewidth=0.6, label="after mending",
+            linewidth=0.6, label="after the extension",
         )  # fmt: skip
         ax.hlines(places, low, high, color="0.2", linewidth=1.0, label="95 % interval of before")
         ax.axvline(0, color="0.2", linewidth=0.8)
@@ -41,7 +41,7 @@ def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
         tidy(ax)
     axes[0].set_yticks(places, [p.part for p in budget], fontsize=8.5)
     axes[0].set_ylim(len(budget) - 0.4, -0.6)
-    figure.supxlabel("share of the squared error before mending [%]", fontsize=9)
+    figure.supxlabel("share of the squared error before the extension [%]", fontsize=9)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside upper left", ncols=3, fontsize=8, frameon=False,
@@ -64,7 +64,8 @@ def budget_table(budget: Sequence[BudgetPart]) -> Table:
         for p in budget
     ]
     head = ["part", *(LABELS.get(s, s).split(" [")[0] for s in states)]
-    caption = "Whose the squared held-out error is, before mending [%] (95 % interval)"
+    caption = "Sources of the squared held-out error before the model is extended [%] (95 % "
+    "interval)"
     return Table(caption, head, rows)
 
 
@@ -95,9 +96,7 @@ def noise_sentence(budget: Sequence[BudgetPart], gain: Mapping[str, Gain]) -> st
         told.append(f"{name} {100 * share:.0f} %")
         if state in gain:
             bounds.append(f"{name} {100 - (100 - gain[state].after) * share**0.5:.0f} %")
-    said = (
-        f"Of the squared error that is left, this much is noise of the sensors: {', '.join(told)}"
-    )
+    said = f"Sensor noise makes up this much of the squared error that is left: {', '.join(told)}"
     if bounds:
         said += (
             f". Measured with that noise, a perfect model would have a fit of about "

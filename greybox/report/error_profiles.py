@@ -1,4 +1,4 @@
-"""How the error of a free run depends on something, with intervals that know its memory.
+"""The error of a free run against another quantity, with intervals that allow for its memory.
 
 The error of a simulation is a long-memory series: a mean over n samples is worth far fewer
 than n. Its samples are therefore grouped into blocks longer than that memory, and blocks

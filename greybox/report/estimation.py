@@ -23,6 +23,8 @@ from greybox.estimation.tried import Comparison
 from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult, TrustLevel
 from greybox.model.terms import parameter_unit
+from greybox.prediction.helm import find_helm
+from greybox.prediction.steady import kept_from_straight
 from greybox.report.chart import chart_of
 from greybox.report.estimation_figures import (
     MOST_DRAWN,
@@ -138,24 +140,26 @@ def _next_steps(estimate: Estimate, record: Mapping[str, Any]) -> list[NextStep]
                 f"greybox diagnose {logs} --vessel {vessel}{held} --report diagnosis.html",
             )
         )
-    if level is PredictionLevel.GOOD:
+    helm = find_helm(estimate.vessel)
+    if level is PredictionLevel.GOOD and helm.kind != "none":
+        free = " --no-limits" if kept_from_straight(helm) else ""
         steps.append(
             NextStep(
                 "Predict manoeuvres of the ship",
-                f"greybox predict {model} zigzag --report zigzag.html",
+                f"greybox predict {model} zigzag{free} --report zigzag.html",
             )
         )
     if level is PredictionLevel.NOT_JUDGED:
         steps.append(
             NextStep(
-                "See how well it predicts a log that took no part",
+                "See how well it predicts a log that it was not estimated on",
                 f"greybox compare {model} --log LOG --report compare.html",
             )
         )
     if trust is TrustLevel.TRUST_EXCEPT:
         steps.append(
             NextStep(
-                "Plan a trial that makes the coefficients surer",
+                "Plan a trial that narrows the intervals of the coefficients",
                 f"greybox design --vessel {vessel} --model {model} --for coefficients "
                 f"--duration 900 --out plan.csv",
             )
@@ -253,7 +257,7 @@ def _parameters(predicts: Estimate) -> Section:
     ]  # fmt: skip
     caption = "95 % intervals relative to each value; at −100 % a parameter would be zero."
     if sets:
-        caption += " Light: what the instruments allow, safe even where they are weak."
+        caption += " Light: the interval that holds even where the instruments are weak."
     if wide:
         caption += f" Wider than drawn: {', '.join(wide)}."
     worst = "; ".join(
@@ -320,7 +324,10 @@ def _pairs(labels: Sequence[str], correlation: Array) -> list[str]:
     strong = [p for p in pairs if abs(p[2]) > _WORTH_TELLING]
     if not strong:
         one, other, value = pairs[0]
-        return [f"No two estimates hang together; most do {one} and {other} ({value:.2f})."]
+        return [
+            f"No two estimates are strongly correlated; the most correlated are {one} and {other} "
+            f"({value:.2f})."
+        ]
     shown = ", ".join(f"{a} and {b} ({value:.2f})" for a, b, value in strong)
     return [f"The log tells these pairs apart worst (correlation): {shown}."]
 
@@ -371,13 +378,14 @@ def _residuals(estimate: EstimateValues) -> Section | None:
     ]
     figure = residual_figure(states, own, inputs)
     caption = (
-        "Correlation of the one-step residuals with themselves and with the inputs; grey holds "
-        "95 % of what chance does, filled marks lie outside it. Neighbours depend on one another: "
+        "Correlation of the one-step residuals with themselves and with the inputs; grey holds 95 "
+        "% of the values that chance gives, filled marks lie outside it. Neighbours depend on one "
+        "another: "
         "the tests weigh all of them together."
     )
     sentence = (
-        "Residuals of regressions on noisy measurements have a memory of their own, which is no "
-        "fault; an input that explains them is one, for the model then lacks something."
+        "Residuals of regressions on noisy measurements are coloured, which is no fault; but "
+        "where an input explains them, the model lacks something."
     )
     return Section(
         "3. What do the residuals say?", [sentence],

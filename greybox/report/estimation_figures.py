@@ -113,7 +113,7 @@ def tried_figure(comparison: Comparison) -> Figure:
     errors = np.array([r.se or 0.0 for r in rows])
     taken = np.array([r.chosen for r in rows])
     for which, colour, marker, said in (
-        (~taken, BLUE, "o", "tried"), (taken, VERMILION, "D", "taken"),
+        (~taken, BLUE, "o", "tried"), (taken, VERMILION, "D", "chosen"),
     ):  # fmt: skip
         if which.any():
             ax.errorbar(

@@ -44,7 +44,7 @@ def fleet_page(fleet: Fleet, record: Mapping[str, Any]) -> Page:
         headline=f"{verdict[0].upper()}{verdict[1:]}.",
         sentences=[
             *(_capital(fleet.difference_sentence(c)) for c in fleet.differing),
-            f"Every ship was estimated alike: {fleet.model.sentence}",
+            f"Every ship was estimated in the same way: {fleet.model.sentence}",
             *(_capital(one.sentence) for one in fleet.left_out),
         ],
         lead=_map(fleet),
@@ -138,8 +138,8 @@ def _map(fleet: Fleet) -> Picture:
     bar.ax.tick_params(labelsize=8)
     few = f" Of {len(fleet.ships)} ships the {len(shown)} most deviating are drawn."
     caption = (
-        "How far the own estimate of each ship lies from the mean of the class, in standard "
-        "deviations of error and spread together; a frame marks in what a ship differs beyond "
+        "The deviation of each ship's own estimate from the mean of the class, in standard "
+        "deviations of error and spread together; a frame marks a coefficient that differs beyond "
         f"chance.{few if len(shown) < len(fleet.ships) else ''}"
     )
     far = np.unravel_index(np.abs(deviations).argmax(), deviations.shape)
@@ -204,13 +204,13 @@ def _ships_section(fleet: Fleet) -> Section:
     figure = _coefficients_figure(fleet)
     caption = (
         f"Each coefficient of each ship: its own estimate with the {100 * LEVEL:.0f} % interval "
-        "(grey), what pooling makes of it (blue), the mean of the class (line); ships in the order "
+        "(grey), its pooled one (blue), the mean of the class (line); ships in the order "
         "of the table."
     )
     told = [
-        "The distance is that of Mahalanobis from what the other ships predict; the p-value is "
-        "that of as large a deviation by chance, adjusted for the number of ships (Holm) and for "
-        "how little few ships tell of the spread between them."
+        "The distance is the Mahalanobis distance from the prediction of the other ships; the "
+        "p-value is the probability of so large a deviation by chance, adjusted for the number of "
+        "ships (Holm) and for the uncertain spread between few ships."
     ]
     return Section(
         "2. Which ship differs?", told, [Picture(to_svg(figure, "ships"), caption)], [table]
@@ -268,9 +268,9 @@ def _time_section(fleet: Fleet) -> Section | None:
         "fall beyond chance, adjusted for their number (Holm)."
     ]
     if not changes:
-        told.append("Drawn is the one that is nearest to a change.")
+        told.append("The one that is nearest to a change is drawn.")
     elif len(changes) > len(drawn):
-        told.append(f"The {len(drawn)} surest are drawn.")
+        told.append(f"The {len(drawn)} most significant are drawn.")
     pictures = []
     for n, (_, i, j) in enumerate(drawn):
         trend = fleet.trends[i]

@@ -1,4 +1,4 @@
-"""Errors of free runs put end to end, with what they may follow."""
+"""Errors of free runs put end to end, with the quantities that they may depend on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of one log before any model: where the ship went, what moved it, what blew."""
+"""Pictures of one log before any model: track, motion, inputs and wind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one model has that another has not: terms, coefficients, actuators, sensors."""
+"""Differences between two models: terms, coefficients, actuators, sensors."""
 
 from __future__ import annotations
 

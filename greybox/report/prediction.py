@@ -34,8 +34,8 @@ _TITLES = {
 _DEGREES = 180 / math.pi
 
 _DOUBTS = {
-    PredictionLevel.LIMITED: ("the model's free run was of limited use on logs that took no part",),
-    PredictionLevel.POOR: ("the model's free run was poor on logs that took no part",),
+    PredictionLevel.LIMITED: ("the model's free run was of limited use on held-out logs",),
+    PredictionLevel.POOR: ("the model's free run was poor on held-out logs",),
 }
 
 
@@ -50,7 +50,7 @@ def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any]) -> Page:
         sentences=[f"{made.steering[0].upper()}{made.steering[1:]}."],
         sections=[
             *sections,
-            *([Section("What to know of these numbers", points=_points(made.notes))]
+            *([Section("Notes on these numbers", points=_points(made.notes))]
               if made.notes else []),
         ],
         lead=replace(lead, caption=f"{sections[0].title}: {lead.caption}"),
@@ -82,7 +82,7 @@ def _next_steps(made: ManoeuvrePrediction, record: dict[str, Any]) -> list[NextS
     if not agreements:
         steps.append(
             NextStep(
-                "Lay the manoeuvre beside it once it has been sailed",
+                "Compare it with the manoeuvre once that has been sailed",
                 f"greybox predict {model} {made.kind} --trial LOG --report beside.html",
             )
         )
@@ -194,7 +194,7 @@ def _beside(made: PredictedManoeuvre) -> Table:
 
 
 def _pictures(made: PredictedManoeuvre, key: str) -> list[Picture]:
-    note = "The estimate's own run, and where 95 % of the draws are (shaded)."
+    note = "The estimate's own run, and the range of 95 % of the draws (shaded)."
     if made.agreement is not None:
         note += f" Black: measured in {made.agreement.log}."
     if made.order is None:
@@ -207,7 +207,7 @@ def _pictures(made: PredictedManoeuvre, key: str) -> list[Picture]:
     ]
     if "steering" in made.bundle.nominal:
         panels.append(("steering", "steering [deg]", _DEGREES))
-    drawn = "The track of the estimate's own run, and of some draws."
+    drawn = "Tracks of the estimate's own run and of some draws."
     if made.kind == "zigzag":
         drawn += " Its scales along and across differ."
     return [

@@ -31,7 +31,7 @@ _HELD_OUT = 1 / 3
 # parts of the held-out runs, for a standard error
 _BLOCKS = 6
 # said of what could not be tried
-OVER = "not tried: time was over (--effort)"
+OVER = "not tried: time ran out (--effort)"
 # share of the time that is left that the comparison may take
 _OF_ALL = 0.3
 # refinements of the instruments while alternatives are compared
@@ -121,7 +121,7 @@ def alternatives_for(
 
 
 def structures_to_try(logs: Sequence[TrialLog], wind: bool) -> list[str]:
-    """Return the structures to try where the user names none, the fullest first.
+    """Return the structures to try where the user names none, the largest first.
 
     On a nearly constant heading an unmeasured wind or current is a constant
     force, which the bias-capturing terms cannot be told from.

@@ -1,4 +1,4 @@
-"""What the comparisons of a choice tried, as tables of one kind."""
+"""Tables of the alternatives that were compared for a choice."""
 
 from __future__ import annotations
 

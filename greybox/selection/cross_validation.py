@@ -42,7 +42,7 @@ _REFINEMENTS = 4
 
 @dataclass(frozen=True)
 class EstimatorVariant:
-    """An estimator: its method, and what output error measures its errors in."""
+    """An estimator: its method, and the scale of errors of output error."""
 
     method: str
     weights: Weights = "noise"

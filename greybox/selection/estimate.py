@@ -460,7 +460,7 @@ def _or_selected_terms(
         note = f"the selected terms could not be estimated on the whole logs: {error}"
         return _noting(told, note), logs, None
     if diverged:
-        return _noting(told, "the selected terms diverge, and were left."), logs, None
+        return _noting(told, "the selected terms diverge, and were rejected."), logs, None
     estimate = replace(estimate, tried=told.tried)
 
     def refit(fitting: Sequence[TrialLog]) -> ManoeuvringModel:
@@ -583,9 +583,9 @@ def _or_output_error(
         if _rank(tried)[0] == 2:
             why = (
                 f"its free run is better than a constant in more of the states, though neither "
-                f"is to be trusted: {before}"
+                f"can be trusted: {before}"
             )
-        note = f"{other.words} was taken, because {why}."
+        note = f"{other.words} was chosen, because {why}."
         return _noting(tried, note, compared(True, str(tried.verdict.level))), tried
     note = f"{other.words} was tried too, and is judged no better: '{tried.verdict.text}'."
     return _noting(found, note, compared(False, str(tried.verdict.level))), tried
@@ -618,12 +618,12 @@ def _by_held_out_runs(
         except GreyboxError as error:
             return _noting(found, f"{way.label} failed on the whole logs: {error}")
     if diverged and not _diverges(found):
-        return _noting(found, f"{way.label} diverges on the whole logs, and was left.")
+        return _noting(found, f"{way.label} diverges on the whole logs, and was rejected.")
     if ESTIMATORS[way.method].free_run and _level(other) < _level(found):
         # the free run is what it fits, so this is no optimum to speak of
         return _noting(
             found,
-            f"{way.label} follows the whole logs less well than {found.method}, and was left.",
+            f"{way.label} follows the whole logs less well than {found.method}, and was rejected.",
         )
     lacks = misfit(found.tests) or (misfit(spare.tests) if spare else ())
     if lacks and _rank(other)[0] < 2:
@@ -656,7 +656,7 @@ def _first_that_runs(
     fallback: Estimate | None = None
     for alternative in alternatives:
         if fallback is not None and seconds_left() <= 0:
-            notes.append(f"{alternative.label} was not tried: time was over (--effort).")
+            notes.append(f"{alternative.label} was not tried: time ran out (--effort).")
             continue
         try:
             # the first one ends at any rate
@@ -665,11 +665,11 @@ def _first_that_runs(
         except GreyboxError as error:
             _log.info("%s is left: %s", alternative.label, error)
             failures.append(error)
-            notes.append(f"{alternative.label} was left: {error}")
+            notes.append(f"{alternative.label} was rejected: {error}")
             continue
         if not diverged:
             return estimate
-        notes.append(f"{alternative.label} was left: its free run diverges.")
+        notes.append(f"{alternative.label} was rejected: its free run diverges.")
         fallback = fallback or estimate
     if fallback is None:
         raise failures[0]
@@ -691,7 +691,7 @@ def _finished(
     estimate = estimate_once(
         logs, alternative.structure, alternative.method, alternative.kind, request, start
     )
-    reason = f"{alternative.label} was taken: {alternative.reason}." if alternative.reason else ""
+    reason = f"{alternative.label} was chosen: {alternative.reason}." if alternative.reason else ""
     estimate, diverged = with_runs(estimate, logs, notes, reason)
     fit = estimate.fit
     if request.judged:
@@ -714,7 +714,7 @@ def _finished(
 def with_runs(
     estimate: Estimate, logs: Sequence[TrialLog], notes: Sequence[str] = (), reason: str = ""
 ) -> tuple[Estimate, bool]:
-    """Return an estimate with its free-run fit and what that says, and whether a run diverges.
+    """Return an estimate with its free-run fit and notes on it, and whether a run diverges.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""An estimate from logs larger than memory: sums over all samples, tests on what tells most."""
+"""An estimate from logs larger than memory: sums over all samples, tests on selected stretches."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class StreamEstimate:
 
 
 def require_adding(request: Request) -> None:
-    """Refuse what needs all samples at a time.
+    """Refuse options that need all samples in memory at once.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def require_adding(request: Request) -> None:
         asked = f"--covariance {request.covariance}"
     if asked:
         raise UsageError(
-            f"{asked} needs all samples in memory at a time, and these logs are read in passes: "
+            f"{asked} needs all samples in memory at once, and these logs are read in passes: "
             f"give it more --memory or fewer logs, or use --method {' or '.join(_ADDING)} with "
             f"--covariance cluster."
         )
@@ -129,7 +129,7 @@ def estimate_stream(
     notes: list[str] = []
     if request.method is None:
         notes.append(
-            f"{ESTIMATORS[_ADDING[0]].words} were taken: of the methods whose sums add over a "
+            f"{ESTIMATORS[_ADDING[0]].words} were chosen: of the methods whose sums add over a "
             f"stream, noise in the regressors does not bias them."
         )
     request = replace(request, method=request.method or _ADDING[0], prefilter="none")

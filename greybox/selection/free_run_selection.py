@@ -1,4 +1,4 @@
-"""Selection of terms by the free run itself: forward and backward, judged on what was left out.
+"""Selection of terms by free runs, forward and backward, judged on held-out parts.
 
 At a free run of the terms that are in, one set of sensitivities tells of every term that
 is out how much the squared error would fall (the score test of its coefficient, the other

@@ -1,4 +1,4 @@
-"""Scores of free runs on what an estimate has not seen, and the choice among them.
+"""Scores of free runs on held-out logs, and the choice among alternatives by them.
 
 Differences between alternatives matter, not scores: parts of a log are harder or
 easier for all alike. So an alternative is as good as the best when it falls behind by
@@ -131,7 +131,7 @@ def score_errors(errors: Array, spread: Array, blocks: int) -> Array:
 
 
 def extent(logs: Sequence[TrialLog]) -> tuple[tuple[str, float, float], ...]:
-    """Return by what logs, or parts of them, are known: names, beginnings and ends."""
+    """Return the identity of logs, or parts of them: names, beginnings and ends."""
     return tuple((log.name, float(log.t[0]), float(log.t[-1])) for log in logs)
 
 

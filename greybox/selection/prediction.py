@@ -45,7 +45,7 @@ _MANY = 10_000
 def with_prediction(
     estimate: Estimate, logs: Sequence[TrialLog], request: Request, refit: Refit | None = None
 ) -> Estimate:
-    """Return an estimate with what its free run is good for on logs that took no part.
+    """Return an estimate with the verdict on its prediction of held-out logs.
 
     Parameters
     ----------
@@ -178,13 +178,13 @@ def require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> No
 def part_of_estimate(log: TrialLog) -> UsageError:
     """Return the error that a log validates an estimate which it is part of."""
     return UsageError(
-        f"'{log.name}' is to be estimated on and to validate the estimate: a log that took part "
-        f"cannot judge. Name it once."
+        f"'{log.name}' is given both to estimate on and to validate: a log that the estimate used "
+        f"cannot judge it. Name it once."
     )
 
 
 def require_distinct(logs: Sequence[TrialLog]) -> None:
-    """Refuse logs of equal samples: copies count as new trials, and judge what they took part in.
+    """Refuse logs of equal samples, since copies would count as further, independent trials.
 
     Raises
     ------

@@ -75,7 +75,7 @@ def wald(estimate: Estimate, columns: Sequence[int]) -> float:
 
 
 def least_earning(estimate: Estimate, missed: Collection[str] = ()) -> list[Candidate]:
-    """Return what may be left out next: all that is clearly insignificant, then less of it.
+    """Return the sets of terms to try leaving out next: all insignificant ones, then fewer.
 
     An equation keeps at least one term; constants stay, and the columns whose labels,
     with their equation, are in `missed`.
@@ -152,7 +152,7 @@ def reduce_structure(
     request: Request = CHOOSE,
     progress: Progress = lambda done, total: None,
 ) -> StructureChoice:
-    """Leave out what earns least, again and again, while held-out free runs do not suffer.
+    """Leave out the least useful terms step by step while held-out free runs get no worse.
 
     The column with the smallest robust Wald statistic goes first, several at once where
     they are jointly insignificant; the rest is estimated again. A column stays where the

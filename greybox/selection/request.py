@@ -1,4 +1,4 @@
-"""What a user asks of an estimate; what is left open the data choose."""
+"""The request for an estimate; the data choose what is left open."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _choices() -> dict[str, tuple[str, ...]]:
 
 @dataclass(frozen=True)
 class Request(EstimationOptions):
-    """What an estimate is to be; None leaves a choice to the data.
+    """The options of an estimate; None leaves a choice to the data.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Stretches of a stream that tell most: what has to be in memory is asked of them."""
+"""The most informative stretches of a stream, for computations that need data in memory."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MOVED = 1e-6
 
 @dataclass(frozen=True)
 class Drawn:
-    """Stretches of a stream, and what its segments tell beside.
+    """Stretches of a stream, with statistics of its segments.
 
     Parameters
     ----------

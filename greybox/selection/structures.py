@@ -109,8 +109,8 @@ class StructureChoice(DisplayMixin):
                 + ("  chosen" if row.chosen else f"  {row.note}" if row.note else "")
             )
         lines.append(
-            "AIC and BIC take free-run errors for Gaussian and count them as the independent "
-            "samples that the best row's are worth; where something beside the model moves the "
+            "AIC and BIC assume Gaussian free-run errors, and count as many of them as the best "
+            "row's errors have independent samples; where something that the model lacks moves the "
             "ship they are no more than a hint."
         )
         return "\n".join(lines)
@@ -316,13 +316,13 @@ def told(estimate: Estimate, found: Ranking, rows: Sequence[StructureRow]) -> Es
         note = (
             f"structure '{name}' is the smallest of {len(rows) - untried} whose held-out free run "
             f"is within one standard error of the best ({found.behind[found.chosen]:.2f} ± "
-            f"{found.se[found.chosen]:.2f} % behind); its standard errors do not know that it was "
-            f"chosen on the same logs."
+            f"{found.se[found.chosen]:.2f} % behind); its standard errors do not account for the "
+            f"choice on the same logs."
         )
         if untried:
-            note += f" {untried} more could not be tried: time was over (--effort)."
+            note += f" {untried} more could not be tried: time ran out (--effort)."
     else:
-        note = f"structure '{name}' was compared with no other: time was over (--effort)."
+        note = f"structure '{name}' was compared with no other: time ran out (--effort)."
     own = TriedModel(
         "", estimate.predictor.kind, estimate.method, estimate.sample_time,
         law_in_words(estimate.vessel.thrusters[0].thrust), 0,

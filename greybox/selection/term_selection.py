@@ -89,7 +89,7 @@ class Terms:
 
 @dataclass(frozen=True)
 class Step:
-    """How a model goes over a sample, and what logged commands do during it."""
+    """The integrator of a model, and how logged commands run between samples."""
 
     integrator: Integrator = "euler"
     commands: Between = "held"
@@ -278,7 +278,7 @@ def select_terms(
         f"the logs); "
         + (
             f"the smallest set whose error is larger than the least by no more than one standard "
-            f"error and {_GIVEN_AWAY:g} % was taken."
+            f"error and {_GIVEN_AWAY:g} % was chosen."
             if chosen
             else f"{present} stays."
         )
@@ -290,9 +290,7 @@ def select_terms(
             f"taken."
         )
     if watch.cut:
-        said += (
-            f" Time was over (--effort) before larger sets were tried on {', '.join(watch.cut)}."
-        )
+        said += f" Time ran out (--effort) before larger sets were tried on {', '.join(watch.cut)}."
     known = {
         extent(fitting): found
         for (fitting, _), found in zip(_judging_parts(logs), shorter, strict=True)

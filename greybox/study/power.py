@@ -37,7 +37,7 @@ _PIECE = 32
 
 @dataclass(frozen=True)
 class Judgement:
-    """What a judge says of a trial.
+    """The result of judging a trial.
 
     Parameters
     ----------

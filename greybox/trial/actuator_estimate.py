@@ -1,4 +1,4 @@
-"""What is known of an actuator from its command and feedback, and how a record keeps it."""
+"""The dynamics of an actuator from its command and feedback, and their place in a record."""
 
 from __future__ import annotations
 

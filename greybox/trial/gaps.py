@@ -1,4 +1,4 @@
-"""What counts as a gap in time, for sensors and for logs: the one place that says so."""
+"""The definition of a gap in time, for sensors and for logs."""
 
 from __future__ import annotations
 

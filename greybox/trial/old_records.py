@@ -1,4 +1,4 @@
-"""Records of version 1, which told by sentences what was done to a log, as steps.
+"""Records of version 1, whose sentences on the processing of a log are read as steps.
 
 The only place that knows those sentences. A step keeps the sentence that it was made of, so
 that it is told as it was; what none of them matches is kept as a step without an operation.
@@ -28,7 +28,7 @@ _MENDS: dict[str, tuple[str, Mapping[str, Value]]] = {
 
 
 def steps_of_sentences(derived: Iterable[str], fixed: Iterable[str]) -> tuple[Step, ...]:
-    """Return what the sentences of a record of version 1 tell as steps.
+    """Return the steps that the sentences of a record of version 1 describe.
 
     Parameters
     ----------

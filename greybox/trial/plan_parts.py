@@ -1,4 +1,4 @@
-"""Parts of a plan on the log of the trial that sailed it: what is estimated on, and what judges."""
+"""Parts of a plan on the log that sailed it: the part to estimate on, and that to validate on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a file holds before it is a log: signals, each on its own clock.
+"""Raw recordings: signals, each on its own clock, before they become a log.
 
 Readers return a `Recording`: nothing has been resampled, mended or judged.
 Values are in the units that the source states; names are the source's own,

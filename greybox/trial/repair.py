@@ -1,4 +1,4 @@
-"""Mending a recording by what the checks found."""
+"""Repairs of a recording by the findings of the checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was done to the channels of a log, as typed values; sentences are rendered from them."""
+"""The processing of a log's channels as typed values, from which sentences are made."""
 
 from __future__ import annotations
 

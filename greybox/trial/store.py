@@ -1,4 +1,4 @@
-"""Writing a log, and beside it where it came from."""
+"""Writing a log, and the record of its origin beside it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a log holds: standard manoeuvres, and how long each sign regime lasts."""
+"""The contents of a log: standard manoeuvres, and how long each sign regime lasts."""
 
 from __future__ import annotations
 

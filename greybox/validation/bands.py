@@ -210,7 +210,7 @@ def _coverage(state: str, share: float, usual: Array) -> Coverage:
         f"({100 * low:.0f}-{100 * high:.0f} % usual)"
     )
     if share < low:
-        sentence += ": something that the model lacks moves the ship, or it is another ship by now"
+        sentence += ": something that the model lacks moves the ship, or the ship has changed since"
     elif share > high:
         sentence += ": this log is quieter than those that the model was estimated on"
     return Coverage(share, (low, high), sentence + ".")
@@ -224,7 +224,7 @@ def _missing(model: ManoeuvringModel) -> tuple[str, ...]:
         told.append("the model has no covariance, so its parameters were taken as exact.")
     if model.noise is None:
         told.append(
-            "the model has no noise levels, so bands hold what is uncertain of its parameters "
+            "the model has no noise levels, so its bands hold the uncertainty of its parameters "
             "only: estimate it with --method iv or oe."
         )
     return tuple(told)

@@ -1,4 +1,4 @@
-"""Bands that hold what a model lacks, from free runs on logs that took no part.
+"""Bands that allow for what a model lacks, from free runs on held-out logs.
 
 What a model lacks depends on the motion and is no independent noise, so draws of parameters
 and noise say too little of it. Errors of held-out runs say how much: a calibrated band
@@ -34,7 +34,7 @@ _FREEDOM = 2
 
 @dataclass(frozen=True)
 class RunErrors:
-    """Errors of a free run on a log that took no part, beside what draws say of them.
+    """Errors of a free run on a held-out log, with their standard deviation by the draws.
 
     Parameters
     ----------

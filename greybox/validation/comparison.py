@@ -76,6 +76,8 @@ class Comparison(DisplayMixin):
         for, or the run itself diverges.
     conditions : tuple of tuple of ConditionDifference
         One row a model: in what the logs differ from those it was estimated on.
+    notes : tuple of str
+        What to know of the logs.
     """
 
     names: tuple[str, ...]
@@ -85,6 +87,7 @@ class Comparison(DisplayMixin):
     sign_tests: tuple[SignTest, ...]
     bands: tuple[tuple[Bands | None, ...], ...]
     conditions: tuple[tuple[ConditionDifference, ...], ...]
+    notes: tuple[str, ...] = ()
 
     def fits(self) -> list[dict[str, float]]:
         """Return the mean fit of each model [%]."""
@@ -141,6 +144,7 @@ class Comparison(DisplayMixin):
                 for t in self.sign_tests
             ],
             "start": "mean of the log's first 5 samples",
+            "notes": list(self.notes),
         }
 
     def summary(self) -> str:
@@ -179,7 +183,7 @@ class Comparison(DisplayMixin):
             for d in differences
         ]
         told = (g.sentence for row in self.runs for run in row for g in find_log_gaps(run.log))
-        lines += [f"note: {sentence}" for sentence in dict.fromkeys(told)]
+        lines += [f"note: {sentence}" for sentence in dict.fromkeys((*self.notes, *told))]
         if len(self.runs[0]) > 1:
             lines += [t.sentence for t in self.sign_tests]
         return "\n".join(lines)
@@ -224,6 +228,7 @@ class Comparison(DisplayMixin):
         several = len(self.runs[0]) > 1
         return (
             table([*head, f"{states[0]}: measured, simulated"], rows),
+            items("Notes", self.notes),
             items("Sign tests", [t.sentence for t in self.sign_tests] if several else []),
         )
 

@@ -43,7 +43,7 @@ def information_criteria(
 
 
 def independent_samples(residuals: Sequence[Array], about: Array | None = None) -> Array:
-    """Return how many independent samples coloured residuals are worth, (m,).
+    """Return the effective number of independent samples of coloured residuals, (m,).
 
     Parameters
     ----------

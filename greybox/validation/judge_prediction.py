@@ -1,4 +1,4 @@
-"""What free runs are good for on logs that took no part in the estimate of their model."""
+"""The verdict on a model's prediction, from free runs on held-out logs."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _NONE, _FAR = 1e-300, 1e6
 
 @dataclass(frozen=True)
 class HeldOut:
-    """A free run on a log that took no part in the estimate of its model.
+    """A free run on a log that the estimate did not use of its model.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def judge_prediction(
     seed: int = 0,
     errors: Sequence[RunErrors | None] | None = None,
 ) -> PredictionVerdict:
-    """Say what free runs are good for.
+    """Judge how well free runs predict.
 
     Parameters
     ----------
@@ -350,7 +350,10 @@ def _calibrated(
     known = [e for e in errors if e is not None]
     sides = cross_calibrated(known, states)
     if not sides:
-        return {}, [*told, NoBands("a single run was left out, and none is left to calibrate it")]
+        return {}, [
+            *told,
+            NoBands("only one run was held out, and a band is calibrated on the others"),
+        ]
     outward = [
         e.error / np.maximum(np.where(e.error < 0, *side), _NONE)
         for e, side in zip(known, sides, strict=True)

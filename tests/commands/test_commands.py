@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 from browser import without_scripts
 from schemas import schema
-from virtual import virtual_log, write_csv
+from virtual import recorded, virtual_log, write_csv
 
 from greybox.commands.main import main
+from greybox.trial.log import make_log
+from greybox.vessel.toml import load_vessel
 
-SCRIPT = [sys.executable, "-m", "greybox.commands.main"]
+SCRIPT = [sys.executable, "-m", "greybox"]
 
 
 def run(*arguments):
@@ -232,3 +234,26 @@ def test_no_command_writes_over_what_it_reads(tmp_path, capsys):
     same = str(tmp_path / "same")
     assert main(["estimate", path, "--vessel", "thesis", "--out", same, "--json", same]) == 1
     assert "which out names too" in capsys.readouterr().err
+
+
+def test_columns_in_another_unit_are_told_by_every_command_that_reads_logs(tmp_path, capsys):
+    columns = recorded(5, rate=1.0)
+    columns |= {n: np.degrees(columns[n]) for n in ("psi", "alpha1")}
+    columns |= {n: columns[n] / 0.514444 for n in ("u", "v")}
+    log = tmp_path / "trial.csv"
+    write_csv(make_log(load_vessel("thesis"), columns, 1.0), log, **columns)
+    known = ("--log", log), (log, "--vessel", "thesis")
+    model = tmp_path / "m.json"
+    assert run("check", *known[1]) == 0
+    found = [s.strip().removeprefix("fix: ") for s in capsys.readouterr().out.splitlines()]
+    for command in (
+        ["estimate", *known[1], *LEAST, "--out", model],
+        ["compare", model, *known[0], "--no-bands"],
+        ["diagnose", *known[1], "--model", model, "--causes", "current"],
+    ):
+        assert run(*command) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        for name, unit in (("psi", "deg"), ("alpha1", "deg"), ("u", "kn"), ("v", "kn")):
+            mend = f'"{name}" = {{ name = "{name}", unit = "{unit}" }}'
+            assert mend in said, (command[0], mend)
+            assert any(mend in line for line in found)

@@ -103,7 +103,7 @@ def test_a_broken_file_of_a_stream_is_left_out_and_named(folder, tmp_path):
 def test_what_needs_all_samples_is_refused_of_a_stream(folder, capsys, options, asked):
     common = ["estimate", str(folder), "--vessel", "thesis", "--memory", "0.001"]
     assert main([*common, *options]) == 1
-    assert f"{asked} needs all samples in memory at a time" in capsys.readouterr().err
+    assert f"{asked} needs all samples in memory at once" in capsys.readouterr().err
 
 
 def test_structures_are_compared_on_stretches_of_a_stream(folder, tmp_path):
@@ -118,4 +118,4 @@ def test_structures_are_compared_on_stretches_of_a_stream(folder, tmp_path):
 def test_a_file_of_a_stream_does_not_validate_it(folder, capsys):
     options = [*OPTIONS, "--memory", "0.001", "--validate", str(folder / "day1.csv")]
     assert main(["estimate", str(folder), *options]) == 1
-    assert "a log that took part cannot judge" in capsys.readouterr().err
+    assert "a log that the estimate used cannot judge it" in capsys.readouterr().err

@@ -135,8 +135,8 @@ def test_angles_that_cannot_be_radians_are_told(tmp_path, capsys):
     given = ["import", tmp_path / "raw.csv", "--vessel", "thesis", "--out", tmp_path / "log.csv"]
     status, out, _ = run(capsys, *given)
     assert status == 0
-    assert "note: alpha1 reaches 45.84, which cannot be radians" in out
-    assert "multiply alpha1 by pi/180 (import --fix does)" in out
+    assert "note: alpha1 reaches 45.84, above the 12.6 rad that it can reach" in out
+    assert 'write "alpha1" = { name = "alpha1", unit = "deg" } under [columns]' in out
     assert "columns not used: paint (map those that belong to the log in" in out
     status, out, _ = run(capsys, *given, "--fix", "--fix-not", "stuck")
     assert "note: alpha1 reaches" not in out
@@ -494,8 +494,8 @@ def test_channels_are_smoothed_where_asked(tmp_path, capsys, monkeypatch, limite
         ("r=0", "--smooth r has a window of '0', it must be a positive number of seconds"),
         ("r=-1", "'-1', it must be a positive number"), ("r=nan", "'nan', it must be a positive"),
         ("r=x", "'x', it must be a positive"), ("r=1e999", "'1e999', it must be a positive"),
-        ("psy=4", "'psy' is to be smoothed and the log has no such channel. Did you mean 'psi'?"),
-        ("t=4", "'t' is to be smoothed and the log has no such channel"),
+        ("psy=4", "'psy' cannot be smoothed, for the log has no such channel. Did you mean 'psi'?"),
+        ("t=4", "'t' cannot be smoothed, for the log has no such channel"),
         ("r=1", "r cannot be smoothed: a window of 1 s holds 3 samples of 0.5 s, order 2 needs 4"),
         ("r=50", "a window of 50 s holds 101 samples, the log has 60: use a window of at most 29"),
         ("r=25", "no 51 that follow each other"),

@@ -305,13 +305,7 @@ def test_the_script_says_how_to_install_it(shell, capsys):
     assert "# in those to come:" in shown.splitlines()[-1]
 
 
-def test_names_that_completion_has_by_heart_are_true():
-    from greybox.diagnosis.causes import _OWN
-    from greybox.model.catalogue import get_structure, structure_names
-
-    assert structure_names() == completion.STRUCTURES
-    assert tuple(c.id for c in _OWN) == completion.CAUSES
-    assert get_structure("thesis").parameters == completion.PARAMETERS
+def test_vessels_that_completion_has_by_heart_are_true():
     assert completion.VESSELS == EXAMPLES
 
 

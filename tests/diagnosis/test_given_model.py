@@ -26,7 +26,7 @@ def test_the_model_of_these_logs_has_nothing_wrong(sailed) -> None:
     found = diagnose([trial.estimation], model=model, validate=[trial.validation], options=QUICK)
     assert found.verdict == "none"
     assert found.model.theta.tolist() == model.theta.tolist()
-    assert any("judged as it was given" in n for n in found.notes)
+    assert any("'before' is the model as it was given" in n for n in found.notes)
 
 
 def test_coefficients_that_do_not_hold_here_are_wrong(sailed) -> None:
@@ -36,7 +36,7 @@ def test_coefficients_that_do_not_hold_here_are_wrong(sailed) -> None:
     other = replace(model, theta=model.theta * scale)
     found = diagnose([trial.estimation], model=other, validate=[trial.validation], options=QUICK)
     assert found.verdict == "unexplained"
-    assert "estimated anew, the coefficients of the model lower the squared error" in (
+    assert "estimating the coefficients of the model again lowers the squared error" in (
         found.remaining
     )
     # what is told to be wrong is of the model as it is, not of one that was mended

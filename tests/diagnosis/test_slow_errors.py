@@ -152,7 +152,7 @@ def test_a_force_slower_than_gusts_is_not_nothing() -> None:
     trial = draw(np.random.default_rng([46, 1]), ("slow_force",), kind="manoeuvres")
     found = diagnose([trial.estimation], validate=[trial.validation])
     assert found.verdict == "unexplained"
-    assert "remembered for longer than gusts" in found.remaining
+    assert "lasts longer than gusts" in found.remaining
 
 
 @pytest.mark.long

@@ -10,7 +10,7 @@ from greybox.files import plain
 ROWS = (
     TriedModel("thesis", "augmented", "iv", 1.0, "n", 19, 80.0, 0.5, 0.8, True),
     TriedModel("linear", "basic", "ls", 1.0, "n", 9, 80.5, 0.0, 0.0),
-    TriedModel("linear", "augmented", "iv", 1.0, "n|n|", 9, note="not tried: time was over"),
+    TriedModel("linear", "augmented", "iv", 1.0, "n|n|", 9, note="not tried: time ran out"),
 )
 COMPARED = Comparison("published structures", "held-out runs", "the fullest within one error", ROWS)
 
@@ -18,10 +18,10 @@ COMPARED = Comparison("published structures", "held-out runs", "the fullest with
 def test_the_best_comes_first_and_what_was_taken_is_marked_with_its_reason():
     assert [r.structure for r in COMPARED.ordered] == ["linear", "thesis", "linear"]
     head, rows = COMPARED.table()
-    assert [row[head.index("taken")] for row in rows] == ["", "taken", ""]
+    assert [row[head.index("chosen")] for row in rows] == ["", "chosen", ""]
     assert rows[-1][head.index("score [%]")] == "–"
     assert COMPARED.decision == (
-        "iv, augmented, 19 terms: thesis (thrust ~ n) was taken: the fullest within one error."
+        "iv, augmented, 19 terms: thesis (thrust ~ n) was chosen: the fullest within one error."
     )
 
 
@@ -32,7 +32,7 @@ def test_a_summary_is_short_and_still_has_what_was_taken():
     assert lines[2].startswith("  > iv")
     assert lines[2].endswith("80.0 %, 0.5 ± 0.8 behind")
     assert "1 more" in lines[3]
-    assert "not tried: time was over" in COMPARED.summary()
+    assert "not tried: time ran out" in COMPARED.summary()
 
 
 def test_json_has_every_alternative():

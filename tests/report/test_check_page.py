@@ -334,8 +334,8 @@ def test_what_logs_share_is_drawn_once_and_where_its_repair_does_not_help(tmp_pa
     html = without_scripts(path.read_text())
     # track and signals of each log beside them
     assert html.count("<svg") == 2 + 3 * 2
-    assert html.count("drawn for a, with which it is shared.") == 1
-    assert "come no closer by this repair" in html
+    assert html.count("drawn for a, where it was found, too.") == 1
+    assert "This repair brings the velocities of the whole log no closer" in html
 
 
 @pytest.mark.long
@@ -348,9 +348,11 @@ def test_identifiers_of_several_logs_do_not_collide(tmp_path):
 
 def test_headline_names_the_most_serious():
     clean = report_of([], None)
-    assert headline([clean, clean]) == "No findings in 2 logs."
+    assert headline([clean, clean]) == "Nothing wrong was found in 2 logs."
     vague = replace(clean, outcomes=(Outcome("lever_arm", "cannot tell", "too straight"),))
-    assert headline([vague]) == "No findings in 1 log; nothing can be said of lever_arm."
+    assert (
+        headline([vague]) == "Nothing wrong was found in 1 log; nothing can be said of lever_arm."
+    )
     serious = reading_case("rate reversed")
     mixed = replace(serious, findings=(*row_case("gap").findings, *serious.findings), name="b")
     said = headline([clean, mixed])

@@ -241,7 +241,7 @@ def test_named(pages, written, told):
 def test_none(pages, written, told):
     shown = told["none"]
     assert "Nothing is wrong beyond noise." in shown
-    assert "52 causes were tried; none of them proved itself." in shown
+    assert "52 causes were tried; held-out logs confirm none of them." in shown
     assert "The model stays as it is." in shown
     assert "<ins>" not in written["none"]
     assert "before and after" not in pages["none"].lead.caption
@@ -249,19 +249,19 @@ def test_none(pages, written, told):
 
 def test_whose_the_error_is_stands_in_bars_and_numbers(told):
     page = diagnosis_page(replace(diagnosis_of("named"), budget=BUDGET), RECORD)
-    assert "Whose the squared error" in page.lead.caption
+    assert "Sources of the squared error" in page.lead.caption
     assert "surge u: current 70 %" in page.lead.alternative
     assert "70.0 (65.0 to 75.0)" in text_of(without_scripts(render(page)))
-    assert "Whose the squared" not in told["named"]
+    assert "Sources of the squared" not in told["named"]
     # 0.1 of 0.3 that are left; a fit of 88.1 % leaves an error of 11.9 %
     said = " ".join(page.sentences)
-    assert "noise of the sensors: surge 33 %, sway 33 %, yaw rate 33 %" in said
+    assert "that is left: surge 33 %, sway 33 %, yaw rate 33 %" in said
     assert f"about surge {100 - 11.9 * (1 / 3) ** 0.5:.0f} %" in said
 
 
 def test_confused(told):
     shown = told["confused"]
-    assert "these logs cannot tell which it is: current or heading_bias." in shown
+    assert "these logs cannot tell which cause it is: current or heading_bias." in shown
     assert "greybox design --between" in shown
     assert "heading_bias looks like sway in proportion to surge" in shown
     assert "sway from diverged to 79.3 %" in shown
@@ -270,8 +270,8 @@ def test_confused(told):
 
 def test_unexplained(told):
     shown = told["unexplained"]
-    assert "None of the 52 causes that were tried explains the errors. No more than a force "
-    assert "without a name would help: current." in shown
+    assert "None of the 52 causes that were tried explains the errors. No better than a generic "
+    assert "force would be: current." in shown
     assert "current: the errors of surge and sway" in shown
 
 
@@ -281,8 +281,8 @@ def test_partly(pages, told):
     headline = pages["partly"].headline
     assert headline.startswith("Current: the errors of surge and sway turn")
     assert headline.endswith("What remains of the error is noise (p = 0.41).")
-    assert "These stand, and something remains." in shown
-    assert "No more than a force without a name would help: heading_bias." in shown
+    assert "These causes are confirmed, and an error beyond noise remains." in shown
+    assert "No better than a generic force would be: heading_bias." in shown
 
 
 def test_every_picture_says_what_it_shows(pages):

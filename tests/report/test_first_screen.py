@@ -136,5 +136,5 @@ def test_the_first_screen(written):
 
 def test_the_demo_tells_how_much_of_what_is_left_is_noise(tmp_path, plan, logs, estimate):
     page = demo_page(demo_of(tmp_path, plan, logs[0], estimate), {})
-    assert "noise of the sensors: surge 33 %" in " ".join(page.sentences)
+    assert "that is left: surge 33 %" in " ".join(page.sentences)
     assert "Fit of the free run before and after" in page.lead.caption

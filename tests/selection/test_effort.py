@@ -63,9 +63,9 @@ def test_where_time_is_over_at_once_the_first_estimate_ends_and_the_rest_is_name
     assert set(found.fit) == {"u", "v", "r"}
     assert found.prediction is not None
     told = "\n".join(found.notes)
-    assert "output error was tried too, and failed: its time was over" in told
-    assert "its time was over; give it more with --effort" in told
-    assert "estimators were not compared by held-out runs: its time was over" in told
+    assert "output error was tried too, and failed: time ran out" in told
+    assert "time ran out; allow more with --effort" in told
+    assert "estimators were not compared by held-out runs: time ran out" in told
     with within(1), pytest.raises(OutOfTimeError):
         select_terms([log], "none", 0, Refit(lambda _: found.model()))
 
@@ -82,9 +82,9 @@ def test_structures_are_compared_within_the_time_too(monkeypatch, choose):
     asked = Request(method="iv", predictor="basic", structure="linear", effort=10)
     choice = choose(log, asked)
     assert choice.rows[0].chosen
-    assert "time was over (--effort)" in choice.rows[0].note
+    assert "time ran out (--effort)" in choice.rows[0].note
     told = "\n".join(choice.estimate.notes)
-    assert "'linear' was compared with no other: time was over (--effort)" in told
+    assert "'linear' was compared with no other: time ran out (--effort)" in told
     assert "not refined by the noise: time was too short for it (--effort)" in told
     assert "nothing was held out, because time was too short" in choice.estimate.prediction.text
 

@@ -164,7 +164,7 @@ def test_by_command(tmp_path, logs, capsys):
     assert set(told["fit"]) == {"u", "v", "r"}
     assert told["limits"]["good"] == 0.5
     assert main([*words, "--validate", str(a)]) == 1
-    assert "a log that took part cannot judge" in capsys.readouterr().err
+    assert "a log that the estimate used cannot judge it" in capsys.readouterr().err
 
 
 def test_parts_of_a_plan_are_left_out_and_judge(tmp_path, logs, capsys):

@@ -198,7 +198,7 @@ def test_commands_choose_a_structure(quiet, tmp_path, capsys):
     assert rows[0]["dropped"] == []
     assert sum(r["chosen"] for r in rows) == 1
     assert main([*base, "--structure", "linear", "--compare-structures", "thesis"]) == 1
-    assert "name all that are to be compared there" in capsys.readouterr().err
+    assert "name all structures to compare there" in capsys.readouterr().err
 
 
 @pytest.mark.long

@@ -130,7 +130,7 @@ def test_what_kinds_of_manoeuvre_left_out_show_is_told_beside_the_level(log):
     wrong = HeldOut.of(true_model(log, Ymu=2.5), log)
     found = judge_prediction([own], own=[own, own], elsewhere=[wrong], kinds=["turn"])
     assert found.level is PredictionLevel.GOOD
-    assert "a kind of manoeuvre that its estimate never saw (turn)" in found.reasons[-1]
+    assert "a kind of manoeuvre that the estimate did not use (turn)" in found.reasons[-1]
     told = found.to_dict()
     assert told["elsewhere_rmse"]["v"] > 2 * told["rmse"]["v"]
 
@@ -158,7 +158,7 @@ def test_limits_separate_the_levels():
     assert judged(channel("v", just)).level is PredictionLevel.LIMITED
     poor = judged(channel("u", just + 0.01), channel("v", bad, horizon=0.0))
     assert poor.text == (
-        "poor: the error of surge is 71 % of its spread (at most 50 asked); "
+        "poor: the error of surge is 71 % of its spread (50 % is allowed); "
         "sway is worse than a constant from the start"
     )
 
@@ -170,7 +170,7 @@ def test_what_hardly_moves_does_not_decide():
     assert "yaw rate hardly moved (0.02 m/s beside a noise of 0.1)" in found.reasons[0]
     nothing = judged(still)
     assert nothing.text == (
-        "poor: no channel moved beyond its noise, so its prediction was not put to the test"
+        "poor: no channel moved beyond its noise, so its prediction was not tested"
     )
 
 
@@ -179,7 +179,7 @@ def test_bands_that_miss_limit_the_model_where_that_is_certain():
     assert judged(channel("u", 0.2, bands=few)).text == "good"
     found = judged(channel("u", 0.2, bands=many))
     assert found.text == (
-        "limited: the 95 % bands of surge hold 80 % (74-85) of the measurements (at least 85 asked)"
+        "limited: the 95 % bands of surge hold 80 % (74-85) of the measurements (85 % is required)"
     )
 
 

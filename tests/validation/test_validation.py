@@ -132,7 +132,7 @@ def test_the_theory_chooses_where_its_conditions_hold(noisy_log):
     e = estimate_model([noisy_log])
     assert e.method == "iv"
     assert e.predictor.kind in ("wind", "augmented")
-    assert any("was taken" in n and "(chapter 5)" in n for n in e.notes)
+    assert any("was chosen" in n and "(chapter 5)" in n for n in e.notes)
     assert e.fit["u"] > 50
 
 
@@ -144,7 +144,7 @@ def test_output_error_takes_over_where_it_is_trusted_and_instruments_are_not():
     e = estimate_model([log])
     assert e.method == "oe"
     assert e.verdict.text == "trust"
-    assert "output error was taken, because it is judged 'trust' and iv" in e.notes[-1]
+    assert "output error was chosen, because it is judged 'trust' and iv" in e.notes[-1]
     kept = estimate_model([log], zero_mean=False)
     assert kept.method != "oe"
 

@@ -1,1 +1,1 @@
-"""Optimality criteria of the covariance, one a file."""
+"""Optimality criteria of the covariance, one file each."""

@@ -1,4 +1,4 @@
-"""What every cause says of itself, and what it is told of the case."""
+"""The base class of causes, and the data that a cause is given."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Context:
     fastest: Mapping[str, float] = field(default_factory=dict)
 
     def lacking(self, *terms: str) -> tuple[str, ...]:
-        """Return those of the terms that the structure could have and has not, by their names.
+        """Return the named terms that the structure allows but does not contain.
 
         A spelling that equals a term of (3.55) comes back by its name there.
         """
@@ -128,7 +128,7 @@ class Cause(DisplayMixin):
 
     @abstractmethod
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return the ways in which this cause may be at work; none where it cannot."""
+        """Return the hypotheses of this cause; none where it cannot occur in these logs."""
 
     @abstractmethod
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
@@ -141,5 +141,5 @@ class Cause(DisplayMixin):
         """
 
     def evidence_of(self, hypothesis: Hypothesis, values: Mapping[str, tuple[float, float]]) -> str:
-        """Return the sentence for one of the hypotheses, where its place is worth a word."""
+        """Return the evidence sentence of one hypothesis, with its place where that matters."""
         return self.evidence(values)

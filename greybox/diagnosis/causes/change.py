@@ -22,7 +22,7 @@ _REACH = 0.05
 
 
 class ParameterChange(Cause):
-    """One coefficient is another from some moment on."""
+    """One coefficient takes another value from some moment on."""
 
     id = "parameter_change"
     kind = "change"
@@ -32,7 +32,7 @@ class ParameterChange(Cause):
     reference = "Andrews (1993)"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return one a coefficient; where in time, a scan has to tell."""
+        """Return one hypothesis per coefficient; a scan finds the time."""
         out = []
         for i, term in enumerate(context.structure.terms):
 

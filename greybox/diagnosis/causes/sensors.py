@@ -1,4 +1,4 @@
-"""Sensors that show something else than the motion of the origin now."""
+"""Sensors that do not show the present motion of the origin."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _has_velocities(context: Context) -> bool:
 
 
 class HeadingBias(Cause):
-    """A compass that is off, where the velocities were turned with it."""
+    """A biased compass, by which the velocities were turned into body axes."""
 
     id = "heading_bias"
     kind = "sensor"
@@ -55,7 +55,7 @@ class HeadingBias(Cause):
 
 
 class LeverArm(Cause):
-    """Velocities or positions of an antenna that is not at the origin."""
+    """Velocities or positions of an antenna that is away from the origin."""
 
     id = "lever_arm"
     kind = "sensor"

@@ -1,4 +1,4 @@
-"""Thrusters that do not act as the model says."""
+"""Thrusters that act otherwise than the model assumes."""
 
 from __future__ import annotations
 
@@ -99,12 +99,12 @@ class ThrusterGain(Cause):
     id = "thruster_gain"
     kind = "thruster"
     title = "weak thruster"
-    signature = "errors that follow the force of one thruster, as if it gave a part only"
+    signature = "errors that follow the force of one thruster, as if it gave only a part of it"
     extension = "the thruster's gain in the vessel"
     reference = "Fossen (2011), section 12.3"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return one a thruster, and one a group where groups may be of different strength."""
+        """Return one hypothesis per thruster, and per group where their strengths may differ."""
         thrusters = context.vessel.thrusters
         if len(thrusters) < 2:
             return ()
@@ -137,8 +137,8 @@ class ThrusterGain(Cause):
         """Say which and how weak."""
         name, (value, _) = next(iter(values.items()))
         return (
-            f"the thruster driven by {name.removeprefix('gain_')} gives {100 * value:.0f} % of the "
-            f"force that the other thrusters' model expects of it"
+            f"the thruster driven by {name.removeprefix('gain_')} gives {100 * value:.0f} % of "
+            f"the force that the model of the other thrusters predicts for it"
         )
 
 
@@ -386,7 +386,7 @@ class QuadraticThrust(Cause):
 
 
 class AngleOffset(Cause):
-    """The zero of one thruster's angle is off."""
+    """One thruster's angle has an offset."""
 
     id = "angle_offset"
     kind = "thruster"

@@ -1,1 +1,1 @@
-"""What speaks for a cause: kinematics, held-out logs, and what a generic force does as well."""
+"""Evidence for a cause: kinematics, held-out logs, and comparison with a generic force."""

@@ -1,4 +1,4 @@
-"""What a cause does for logs that it was not fitted to."""
+"""How much a cause improves the prediction of logs that it was not fitted to."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Proof:
 
 @dataclass(frozen=True)
 class Pair:
-    """A hypothesis where it was fitted, and where it has to prove itself.
+    """One hypothesis on the logs that it was fitted to and on the held-out ones.
 
     `known` holds what was computed of it already.
     """
@@ -58,7 +58,7 @@ class Pair:
 
 
 class HeldOut(ABC):
-    """Where causes have to prove themselves."""
+    """The logs, or parts of logs, on which causes must predict better."""
 
     def __init__(self) -> None:
         self._known: dict[int, tuple[Fit, list[Pair]]] = {}

@@ -1,4 +1,4 @@
-"""Measurement causes that need no force model: the log contradicts itself.
+"""Sensor faults that need no force model, because the log contradicts itself.
 
 Positions, heading, velocities and rates of one ship tie each other. What the log checks
 find there with certainty is taken out before forces are judged.
@@ -41,7 +41,7 @@ def recording_of(log: TrialLog) -> Recording:
 
 @dataclass(frozen=True)
 class Kinematics:
-    """What the logs tell of their sensors without any force model.
+    """What the logs show about their sensors without any force model.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Kinematics:
 
 
 def judged_by_kinematics(logs: Sequence[TrialLog]) -> Kinematics:
-    """Return what the logs tell of clocks, lever arms, heading biases and reversed motions.
+    """Return what the logs show about clocks, lever arms, heading biases and reversed motions.
 
     Thrusters are left to the force model. Several logs are judged together and must all have
     it; the first one's values are taken.

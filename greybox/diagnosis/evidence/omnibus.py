@@ -1,4 +1,4 @@
-"""Whether anything is wrong at all: what any force could explain, proved on other logs.
+"""The omnibus test: whether any force at all would explain errors of held-out logs.
 
 A wide set of functions of motion, commands, heading and time pushes each equation; only what
 predicts the held-out logs is a fault of the model and not the sea's own noise.
@@ -39,7 +39,7 @@ class Omnibus:
 
 
 def omnibus(pairs: Sequence[Pair], use: Use = anything) -> Omnibus:
-    """Fit any force to what a model leaves, and prove it on other logs.
+    """Fit a generic force to a model's errors, and test it on other logs.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def omnibus(pairs: Sequence[Pair], use: Use = anything) -> Omnibus:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """How far the coefficients that held-out logs ask for lie from the estimate.
+    """How far the coefficients that fit the held-out logs lie from the estimate.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Whether a cause stands beside a generic force of motion and commands that has no name."""
+"""Whether a cause explains more than a generic force of motion and commands."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FEW = 6
 
 @dataclass(frozen=True)
 class Standing:
-    """What a cause does beside a generic force, and against one of its own arguments.
+    """What a cause adds to a generic force, and how it compares with one of the same arguments.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class Standing:
 
     @property
     def stands(self) -> bool:
-        """Whether the cause does what no force without a name does as well."""
+        """Whether the cause explains what no generic force explains as well."""
         gains = self.beyond.gain > 0 and self.beyond.p_value < self.level
         own = self.share is not None and self.share >= OWN_SHARE and self.half < self.level
         # that a run leaves every bound without it tells nothing of a cause's size

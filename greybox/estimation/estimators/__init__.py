@@ -1,1 +1,1 @@
-"""One file an estimator, each with its ``ENTRY`` in the registry."""
+"""Estimators, one file each, with an ``ENTRY`` for the registry."""

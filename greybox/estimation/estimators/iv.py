@@ -1,4 +1,4 @@
-"""Instrumental variables, refined by the noise where nothing speaks against it: ``--method iv``."""
+"""Instrumental variables, refined by a noise model where the tests allow it: ``--method iv``."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def _prefiltered(
             if problem.stays_bounded(refined) and not mixed:
                 return refined, white
             against = (
-                "something beside the model moves the ship, and the measured wind, which holds "
+                "something that the model lacks moves the ship, and the measured wind, which holds "
                 "that motion, would be mixed into its neighbours (give wind_std in [sensors])"
                 if mixed
                 else "the free run of the refined model diverges"

@@ -73,7 +73,7 @@ def _quick_start(problem: EstimationProblem) -> tuple[Estimate | None, str]:
     try:
         return solve_ls(regression).estimate("white"), "it started from the least-squares estimate."
     except ExcitationError:
-        return None, "it started from nothing."
+        return None, "it had no estimate to start from."
 
 
 ENTRY = Estimator(

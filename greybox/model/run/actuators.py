@@ -1,4 +1,4 @@
-"""Thrusters that act late, one sample at a time: what must be remembered, and how it moves on.
+"""Thrusters that act late: the state that this needs, and its update from sample to sample.
 
 The same delay, rate limit and lag as `greybox.vessel.actuation` makes of whole logs, with the
 commands, limited and lagged values of earlier samples as states.

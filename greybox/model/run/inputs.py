@@ -1,4 +1,4 @@
-"""What a log gives to a model: generalised inputs and heading."""
+"""The inputs of a model on a log: generalised inputs and heading."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ _STEP_RUNS = 16
 
 @dataclass(frozen=True, repr=False)
 class FreeRun(DisplayMixin):
-    """What a free run gave.
+    """The result of a free run.
 
     Parameters
     ----------

@@ -72,7 +72,7 @@ class SymbolicStep:
 
 @dataclass(frozen=True)
 class StepModel:
-    """What one sample does to a ship.
+    """The step of a model over one sample.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""What is wrong with a log, told by kinematics before any force model."""
+"""Defects of a log, found by kinematics before any force model."""

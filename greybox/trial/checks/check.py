@@ -158,6 +158,35 @@ def check_recordings(
     ]
 
 
+def misnamed_columns(paths: Sequence[str | Path], vessel: Vessel) -> list[str]:
+    """Say which columns hold another unit, frame or sign than their names, as a check finds it.
+
+    Parameters
+    ----------
+    paths : sequence of str or Path
+        Logs of one ship.
+    vessel : Vessel
+
+    Returns
+    -------
+    list of str
+        A sentence for each of these findings: the evidence, and what to write or run.
+
+    Raises
+    ------
+    LogError
+        As `check_files`.
+    """
+    logs = [_signal_quality(read_recording(path, vessel), vessel) for path in paths]
+    _read_columns(logs)
+    return [
+        f"{log.recorded.name}: {f.evidence}. To mend it, {f.fix}."
+        for log in logs
+        for f in log.findings
+        if f.id in ("unit", "frame", "sign")
+    ]
+
+
 def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
     """Check the samples of one log, each channel by itself."""
     raw = time_format_findings(recording)
@@ -185,8 +214,8 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
     return log
 
 
-def _kinematics(logs: Sequence[_Log], vessel: Vessel) -> None:
-    """Check what ties positions, heading, velocities and yaw rate of the logs together."""
+def _read_columns(logs: Sequence[_Log]) -> list[Motion | None]:
+    """Check units, frames and signs of the motion channels, and return the motions so read."""
     motions = [log.motion for log in logs]
     for log in logs:
         log.say(frame_outcomes(log.motion))
@@ -196,6 +225,12 @@ def _kinematics(logs: Sequence[_Log], vessel: Vessel) -> None:
     for i, reading in zip(usable, readings, strict=True):
         logs[i].add(reading_findings(reading, names))
         motions[i] = reading.motion
+    return motions
+
+
+def _kinematics(logs: Sequence[_Log], vessel: Vessel) -> None:
+    """Check what ties positions, heading, velocities and yaw rate of the logs together."""
+    motions = _read_columns(logs)
     tied = [Tied(log.recorded.name, log.mended, m) for log, m in zip(logs, motions, strict=True)]
     for log, (found, said) in zip(logs, find_offsets(tied, vessel), strict=True):
         log.findings += found
@@ -221,7 +256,7 @@ def _forces(logs: Sequence[_Log], vessel: Vessel) -> None:
             (f for f in log.findings if f.id in ("sign", "frame", "unit") and not f.safe), None
         )
         if doubt is not None:
-            said = f"the {doubt.id} of {', '.join(doubt.channels)} is to be settled first"
+            said = f"the {doubt.id} of {', '.join(doubt.channels)} must be settled first"
             log.say([Outcome("external_force", "cannot tell", said)])
             continue
         log.findings += forces

@@ -95,6 +95,15 @@ class Finding(DisplayMixin):
         }
 
 
+def declare_unit(names: Sequence[str], unit: str) -> str:
+    """Return how to declare the unit that columns are in, or to convert them."""
+    entries = " and ".join(f'"{n}" = {{ name = "{n}", unit = "{unit}" }}' for n in names)
+    return (
+        f"write {entries} under [columns] of the vessel file, or let greybox import --fix convert "
+        f"the log"
+    )
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What became of one check.

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.rotation import ned_to_body
-from greybox.trial.checks.finding import Finding, Outcome
+from greybox.trial.checks.finding import Finding, Outcome, declare_unit
 from greybox.trial.checks.motion import Motion, integrate, profiles, to_ned
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.steps import Step, mend
@@ -100,7 +100,7 @@ def _unit(
         "unit", group, names, _scaled(names, factor), (mend("scale", names, factor=factor),),
         f"{' and '.join(names)} {'holds' if len(names) == 1 else 'hold'} {held} under a {said} "
         f"name",
-        f"multiply by {factor:.5g} (import --fix does), or map with unit = \"{held}\"",
+        declare_unit(names, held),
         1 / factor, f"{held} per {said}",
     )  # fmt: skip
 
@@ -143,8 +143,7 @@ _PSI = (
     ColumnHypothesis(
         "unit", "psi", ("psi",), _degrees, (mend("scale", ("psi",), factor=_DEG),),
         "psi holds degrees under a radian name",
-        "multiply psi by pi/180 (import --fix does), or map it with unit = \"deg\" in [columns]",
-        180 / np.pi, "deg per rad",
+        declare_unit(("psi",), "deg"), 180 / np.pi, "deg per rad",
     ),
     ColumnHypothesis(
         "sign", "psi", ("psi",), lambda x: {**x, "psi": x["psi"] + np.pi},

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from greybox.channels import ANGLES
 from greybox.numerics.robust import FROM_MEDIAN, robust_deviation
 from greybox.rotation import body_to_ned
-from greybox.trial.checks.finding import Finding
+from greybox.trial.checks.finding import Finding, declare_unit
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, runs
 from greybox.trial.gaps import GAP, HOLE, usual_step
@@ -530,10 +530,9 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
                     180 / np.pi,
                     (180 / np.pi, 180 / np.pi),
                     "deg per rad",
-                    f"{s.name} reaches {largest:.4g}, which cannot be radians: degrees under a "
-                    f"radian name",
-                    f"multiply {s.name} by pi/180 (import --fix does), or map it with "
-                    f'unit = "deg" in [columns]',
+                    f"{s.name} reaches {largest:.4g}, above the {limit:.3g} rad that it can "
+                    f"reach: it holds degrees under a radian name",
+                    declare_unit((s.name,), "deg"),
                     (s.name,),
                     (mend("scale", (s.name,), factor=factor),),
                     True,

@@ -254,7 +254,7 @@ def _smooth(
     for name in names:
         if name not in channels:
             raise LogError(
-                f"'{name}' is to be smoothed and the log has no such channel."
+                f"'{name}' cannot be smoothed, for the log has no such channel."
                 f"{suggestion(name, channels)} It has: {', '.join(channels)}."
             )
         window = options.smooth[name]

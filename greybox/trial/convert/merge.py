@@ -119,8 +119,9 @@ def _one_at_a_time(name: str, offered: list[_Part], notes: list[str]) -> list[_P
         one, two = same.mapped.get(name), part.file.mapped.get(name)
         if one is not None and two is not None and one != two:
             raise LogError(
-                f"columns '{one}' of '{same.name}' and '{two}' of '{part.file.name}' tell of the "
-                f"same times, and [columns] maps both to '{name}': remove one of the two lines "
+                f"columns '{one}' of '{same.name}' and '{two}' of '{part.file.name}' hold values "
+                f"at the same times, and [columns] maps both to '{name}': remove one of the two "
+                f"lines "
                 f"from the vessel file."
             )
         notes.append(

@@ -1,4 +1,4 @@
-"""What the user may decide about an import."""
+"""The options of an import."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from greybox.vessel.conditions import Conditions
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What the user may decide about an import.
+    """The options of an import.
 
     Parameters
     ----------

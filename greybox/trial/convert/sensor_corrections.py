@@ -1,4 +1,4 @@
-"""Taking out of a log what the vessel file's ``[sensors]`` says is wrong with its sensors.
+"""Correction of a log for the sensor errors that the vessel file's ``[sensors]`` states.
 
 Each correction is a step that the vessel file decided. What such steps add up to is known of
 a log, so that one that is written and read again, or imported with a vessel file that said so
@@ -66,7 +66,7 @@ class _Defects:
 
 
 def correct_log(log: TrialLog, vessel: Vessel | None = None) -> TrialLog:
-    """Return a log as it should have been by what a vessel file says of the sensors.
+    """Return a log corrected for the sensor errors that a vessel file states.
 
     Parameters
     ----------

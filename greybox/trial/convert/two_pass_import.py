@@ -1,4 +1,4 @@
-"""Importing a table of any size in two passes: what does not fit in memory goes in blocks.
+"""Import of a table of any size in two passes, in blocks that fit in memory.
 
 The first pass finds clocks, units and origin, from which the samples of the log are planned;
 the second goes the way of every import (`greybox.trial.convert.convert`) block by block.

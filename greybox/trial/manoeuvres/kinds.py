@@ -1,4 +1,4 @@
-"""Of which kind of manoeuvre a log is, by what the ship and its helm did in it."""
+"""The kind of manoeuvre that a log holds, from the motion of the ship and its helm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the text of cells to numbers, words and times; what cannot be read is counted."""
+"""Conversion of cells to numbers, words and times; unreadable ones are counted."""
 
 from __future__ import annotations
 

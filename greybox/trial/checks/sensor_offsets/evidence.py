@@ -1,4 +1,4 @@
-"""What one log says of the offsets: a quadratic likelihood, robust to coloured residuals.
+"""The likelihood of offsets on one log: quadratic, robust to coloured residuals.
 
 The residuals are whitened by the local-level model of `motion`; what belongs to the log alone
 (starts, a current, scales, the gyro's bias) is projected out, Gauss-Newton finds the offsets, and

@@ -1,4 +1,4 @@
-"""Clock offsets, lever arm and heading bias in words, and what mends them."""
+"""Clock offsets, lever arm and heading bias in words, and their repairs."""
 
 from __future__ import annotations
 

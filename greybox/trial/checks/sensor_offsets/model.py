@@ -1,4 +1,4 @@
-"""What ties position, heading, velocity and yaw rate of one log, and what sensors may add to it.
+"""The kinematic relations of one log's channels, and the sensor offsets that may disturb them.
 
 Seven parameters belong to the instruments: the clocks of ψ, u, v, r against that of the positions
 (of r against ψ where there are none), the antenna's lever arm, and the heading bias. Residuals of

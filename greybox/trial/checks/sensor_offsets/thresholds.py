@@ -1,4 +1,4 @@
-"""What an offset must exceed to matter, and what a ship cannot have."""
+"""The least offsets that matter, and the largest that a ship can have."""
 
 from __future__ import annotations
 
