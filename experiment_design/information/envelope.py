@@ -48,7 +48,7 @@ _STRAIGHT, _COURSE = 0.1, 0.25
 # speed at the start, as a share of the fastest straight motion
 _APPROACH = 1.0
 # slowest and fastest steady motion that counts, in what the prior's trial showed
-_SLOWEST, _FASTEST = 0.4, 1.3
+_SLOWEST, _FASTEST = 0.55, 1.3
 # what not even the potential terms say, as a share of the spread of each state
 _UNSAID = 0.05
 # share of the commands under which the prior must hold the ship
@@ -100,7 +100,9 @@ class Envelope:
     _moments: tuple[Array, ...] = field(repr=False)
     _precision: Array = field(repr=False)
 
-    def errors(self, motion: Motion, known: Array | None = None) -> tuple[Array, Array]:
+    def errors(
+        self, motion: Motion, known: Array | None = None, parts: int = 1
+    ) -> tuple[Array, Array]:
         """Return what estimates from R motions would leave of the error of predictions.
 
         Parameters
@@ -108,6 +110,9 @@ class Envelope:
         motion : Motion
         known : ndarray, optional
             (p + q, p + q) moments of other trials, as `information` gives them.
+        parts : int
+            Contiguous parts of a motion; where there are several, each is left out in turn, and
+            the errors are the means over what is left.
 
         Returns
         -------
@@ -118,38 +123,42 @@ class Envelope:
         """
         runs, nx = len(motion.state), self.rollout.nx
         noise, unknown = np.full((runs, nx), np.inf), np.full((runs, nx), np.inf)
-        good = np.flatnonzero(motion.stable)
-        if not len(good):
-            return noise, unknown
-        gram = self.information(motion, good)
-        if known is not None:
-            gram = gram + known
-        told = np.diagonal(gram, axis1=1, axis2=2)[:, : len(self.predictor.columns)]
-        excited = np.isfinite(gram).all(axis=(1, 2)) & (told > 0).all(axis=1)
-        good, gram = good[excited], gram[excited]
-        if not len(good):
-            return noise, unknown
-        whole = gram + np.diag(self._precision)
-        size = np.sqrt(np.diagonal(whole, axis1=1, axis2=2))
-        outer = size[:, :, None] * size[:, None, :]
-        # a direction that is hardly excited stays what the prior says it is
-        left = np.linalg.inv(whole / outer + 1e-9 * np.eye(size.shape[1])) / outer
-        by_prior = left * self._precision @ left
-        for i, w in enumerate(self._moments):
-            noise[good, i] = np.einsum("ab,rab->r", w, left - by_prior)
-            unknown[good, i] = np.einsum("ab,rab->r", w, by_prior)
+        stable = np.flatnonzero(motion.stable)
+        grams = self._by_part(motion, stable, parts)
+        whole = grams.sum(axis=0)
+        told = np.diagonal(whole, axis1=1, axis2=2)[:, : len(self.predictor.columns)]
+        excited = np.isfinite(whole).all(axis=(1, 2)) & (told > 0).all(axis=1)
+        good = stable[excited]
+        noise[good] = unknown[good] = 0.0
+        for part in grams:
+            gram = (whole - part if parts > 1 else whole)[excited]
+            gram = gram + np.diag(self._precision) + (0.0 if known is None else known)
+            size = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
+            outer = size[:, :, None] * size[:, None, :]
+            # a direction that is hardly excited stays what the prior says it is
+            left = np.linalg.inv(gram / outer + 1e-9 * np.eye(size.shape[1])) / outer
+            by_prior = left * self._precision @ left
+            for i, w in enumerate(self._moments):
+                noise[good, i] += np.einsum("ab,rab->r", w, left - by_prior) / parts
+                unknown[good, i] += np.einsum("ab,rab->r", w, by_prior) / parts
         return noise, unknown
 
-    def information(self, motion: Motion, which: NDArray[np.intp] | None = None) -> Array:
+    def information(self, motion: Motion) -> Array:
         """Return what output error tells of primary and potential terms, G (R, p + q, p + q)."""
-        if which is not None:
-            motion = Motion(
-                motion.state[which], motion.tau[which], motion.commands[which], motion.stable[which]
-            )
+        return np.asarray(self._by_part(motion, np.arange(len(motion.state)), 1)[0])
+
+    def _by_part(self, motion: Motion, which: NDArray[np.intp], parts: int) -> Array:
+        """Return the information of each contiguous part of some motions, (parts, R, m, m)."""
+        motion = Motion(
+            motion.state[which], motion.tau[which], motion.commands[which], motion.stable[which]
+        )
         rows, every = _sensitivities(self.rollout, self.predictor, self._features, motion)
         s = np.stack(list(rows), axis=1) / np.sqrt(self.variance)[:, None]
-        s = s.reshape(len(motion.state), -1, s.shape[-1])
-        return np.asarray(every * (s.transpose(0, 2, 1) @ s))
+        told = [
+            part.reshape(len(which), part.shape[1] * part.shape[2], part.shape[3])
+            for part in np.array_split(s, parts, axis=1)
+        ]
+        return every * np.array([part.transpose(0, 2, 1) @ part for part in told])
 
     def pick(self, rng: np.random.Generator) -> Array:
         """Draw one setting (nc,): any, or now and then one that holds a course."""

@@ -24,9 +24,11 @@ Array = NDArray[np.float64]
 
 # random sequences that a search begins with, and that a plan is compared with
 RANDOM = 200
-# share of the trial that is kept for usual manoeuvres: by the last third of a log an estimate
-# chooses its terms
+# share of the trial by which an estimate may be judged that it takes no part in
 VALIDATION = 1 / 3
+# parts of a trial: an estimate chooses its terms by leaving out each of as many in turn, and what
+# is left must tell what the part that is left out shows
+_PARTS = 4
 _CHAINS, _KEPT, _TOGETHER, _ROUNDS = 4, 12, 64, 14
 # of the largest steady yaw rate: how hard the zig-zag turns; time scales of each of its legs
 _TURN, _LEG = 0.6, 3.0
@@ -125,16 +127,11 @@ def search_envelope(
     """
 
     def worth(motion: Motion) -> Array:
-        noise, bias = envelope.errors(motion, known)
+        noise, unknown = envelope.errors(motion, known, _PARTS)
         with np.errstate(divide="ignore"):
-            return np.asarray(-0.5 * np.log((noise + bias).mean(axis=1)))
+            return np.asarray(-0.5 * np.log((noise + unknown).mean(axis=1)))
 
-    holds = problem.shape[0]
-    hold = problem.schedule.hold * problem.schedule.sample_time
-    tail = usual_manoeuvres(envelope, validation_holds(holds), hold)
-    return exchange_settings(
-        problem, envelope, worth, seed, effort=effort, tail=tail, workers=workers
-    )
+    return exchange_settings(problem, envelope, worth, seed, effort=effort, workers=workers)
 
 
 def exchange_settings(
@@ -144,7 +141,6 @@ def exchange_settings(
     seed: int,
     *,
     effort: float = 1.0,
-    tail: Array | None = None,
     tries: int = _TOGETHER,
     workers: int | None = None,
 ) -> EnvelopeSearch:
@@ -160,8 +156,6 @@ def exchange_settings(
     seed : int
     effort : float
         Times the usual number of rounds.
-    tail : ndarray, optional
-        (k, nc) levels that every sequence ends with.
     tries : int
         Sequences that each round of each chain tries.
     workers : int, optional
@@ -169,19 +163,13 @@ def exchange_settings(
     """
     holds = problem.shape[0]
     hold = problem.schedule.hold * problem.schedule.sample_time
-    end = np.zeros((0, problem.shape[1])) if tail is None else tail
-    free = holds - len(end)
-    longest = max(1, min(free, round(HOLDS[1] * envelope.time_scale / hold)))
-
-    def whole(levels: Array) -> Array:
-        both = np.concatenate([levels, np.broadcast_to(end, (len(levels), *end.shape))], axis=1)
-        return problem.schedule.within_reach(both)
+    longest = max(1, min(holds, round(HOLDS[1] * envelope.time_scale / hold)))
 
     def judged(levels: Array) -> list[tuple[Array, Candidate]]:
         out = []
         for first in range(0, len(levels), _TOGETHER):
             part = levels[first : first + _TOGETHER]
-            complete = whole(part)
+            complete = problem.schedule.within_reach(part)
             motion = problem.scenarios[0].rollout.run(problem.schedule.expand(complete))
             value = worth(motion)
             missed = problem.scenarios[0].limits.violations(motion)
@@ -195,10 +183,10 @@ def exchange_settings(
         return out
 
     def drawn(count: int, rng: np.random.Generator) -> Array:
-        out = np.empty((count, free, len(problem.schedule.commands)))
+        out = np.empty((count, holds, len(problem.schedule.commands)))
         for levels in out:
             k = 0
-            while k < free:
+            while k < holds:
                 held = _held(rng, longest)
                 levels[k : k + held] = envelope.pick(rng)
                 k += held
@@ -208,11 +196,11 @@ def exchange_settings(
         out = levels.copy()
         for _ in range(int(rng.integers(1, 4))):
             held = _held(rng, longest)
-            i = int(rng.integers(free - held + 1))
+            i = int(rng.integers(holds - held + 1))
             if rng.random() < _ANEW:
                 out[i : i + held] = envelope.pick(rng)
             else:
-                j = int(rng.integers(free - held + 1))
+                j = int(rng.integers(holds - held + 1))
                 out[i : i + held], out[j : j + held] = (
                     out[j : j + held].copy(), out[i : i + held].copy(),
                 )  # fmt: skip
