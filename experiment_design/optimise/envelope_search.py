@@ -97,11 +97,6 @@ def usual_manoeuvres(envelope: Envelope, holds: int, hold: float) -> Array:
     return np.asarray(whole[:holds])
 
 
-def validation_holds(holds: int) -> int:
-    """Return how many of a trial's holds, its last, are usual manoeuvres."""
-    return round(VALIDATION * holds)
-
-
 def search_envelope(
     problem: TrialProblem,
     envelope: Envelope,
