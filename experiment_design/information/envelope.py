@@ -100,9 +100,7 @@ class Envelope:
     _moments: tuple[Array, ...] = field(repr=False)
     _precision: Array = field(repr=False)
 
-    def errors(
-        self, motion: Motion, known: Array | None = None, parts: int = 1
-    ) -> tuple[Array, Array]:
+    def errors(self, motion: Motion, known: Array | None = None) -> tuple[Array, Array]:
         """Return what estimates from R motions would leave of the error of predictions.
 
         Parameters
@@ -110,9 +108,6 @@ class Envelope:
         motion : Motion
         known : ndarray, optional
             (p + q, p + q) moments of other trials, as `information` gives them.
-        parts : int
-            Contiguous parts of a motion; where there are several, each is left out in turn, and
-            the errors are the means over what is left.
 
         Returns
         -------
@@ -121,34 +116,52 @@ class Envelope:
             not tell, in the variance of the state; inf where a run is unstable or a term not
             excited.
         """
-        runs, nx = len(motion.state), self.rollout.nx
-        noise, unknown = np.full((runs, nx), np.inf), np.full((runs, nx), np.inf)
-        stable = np.flatnonzero(motion.stable)
-        grams = self._by_part(motion, stable, parts)
-        whole = grams.sum(axis=0)
-        told = np.diagonal(whole, axis1=1, axis2=2)[:, : len(self.predictor.columns)]
-        excited = np.isfinite(whole).all(axis=(1, 2)) & (told > 0).all(axis=1)
-        good = stable[excited]
-        noise[good] = unknown[good] = 0.0
-        for part in grams:
-            gram = (whole - part if parts > 1 else whole)[excited]
-            gram = gram + np.diag(self._precision) + (0.0 if known is None else known)
-            size = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
-            outer = size[:, :, None] * size[:, None, :]
-            # a direction that is hardly excited stays what the prior says it is
-            left = np.linalg.inv(gram / outer + 1e-9 * np.eye(size.shape[1])) / outer
-            by_prior = left * self._precision @ left
-            for i, w in enumerate(self._moments):
-                noise[good, i] += np.einsum("ab,rab->r", w, left - by_prior) / parts
-                unknown[good, i] += np.einsum("ab,rab->r", w, by_prior) / parts
+        noise, unknown = np.full((2, len(motion.state), self.rollout.nx), np.inf)
+        good, (gram,) = self._telling(motion, 1)
+        left = self._covariance(gram, known)
+        by_prior = left * self._precision @ left
+        for i, w in enumerate(self._moments):
+            noise[good, i] = np.einsum("ab,rab->r", w, left - by_prior)
+            unknown[good, i] = np.einsum("ab,rab->r", w, by_prior)
         return noise, unknown
+
+    def error_without_parts(self, motion: Motion, known: Array | None, parts: int) -> Array:
+        """Return the error (R,) of both kinds with contiguous parts of R motions left out in turn.
+
+        The mean over them and over the states; see `errors`.
+        """
+        found = np.full(len(motion.state), np.inf)
+        good, grams = self._telling(motion, parts)
+        found[good] = 0.0
+        whole, w = grams.sum(axis=0), np.mean(self._moments, axis=0)
+        for part in grams:
+            left = self._covariance(whole - part, known)
+            found[good] += np.einsum("ab,rab->r", w, left) / parts
+        return found
+
+    def _covariance(self, gram: Array, known: Array | None) -> Array:
+        """Return the covariance (R, m, m) of coefficients that moments and the prior leave."""
+        gram = gram + np.diag(self._precision) + (0.0 if known is None else known)
+        size = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
+        outer = size[:, :, None] * size[:, None, :]
+        # a direction that is hardly excited stays what the prior says it is
+        return np.asarray(np.linalg.inv(gram / outer + 1e-9 * np.eye(size.shape[1])) / outer)
 
     def information(self, motion: Motion) -> Array:
         """Return what output error tells of primary and potential terms, G (R, p + q, p + q)."""
         return np.asarray(self._by_part(motion, np.arange(len(motion.state)), 1)[0])
 
+    def _telling(self, motion: Motion, parts: int) -> tuple[NDArray[np.intp], Array]:
+        """Return which runs tell all primary terms, and the information of their parts."""
+        stable = np.flatnonzero(motion.stable)
+        grams = self._by_part(motion, stable, parts)
+        whole = grams.sum(axis=0)
+        size = np.diagonal(whole, axis1=1, axis2=2)[:, : len(self.predictor.columns)]
+        excited = np.isfinite(whole).all(axis=(1, 2)) & (size > 0).all(axis=1)
+        return stable[excited], grams[:, excited]
+
     def _by_part(self, motion: Motion, which: NDArray[np.intp], parts: int) -> Array:
-        """Return the information of each contiguous part of some motions, (parts, R, m, m)."""
+        """Return the information of each contiguous part of some runs, (parts, R, m, m)."""
         motion = Motion(
             motion.state[which], motion.tau[which], motion.commands[which], motion.stable[which]
         )

@@ -122,9 +122,8 @@ def search_envelope(
     """
 
     def worth(motion: Motion) -> Array:
-        noise, unknown = envelope.errors(motion, known, _PARTS)
         with np.errstate(divide="ignore"):
-            return np.asarray(-0.5 * np.log((noise + unknown).mean(axis=1)))
+            return np.asarray(-0.5 * np.log(envelope.error_without_parts(motion, known, _PARTS)))
 
     return exchange_settings(problem, envelope, worth, seed, effort=effort, workers=workers)
 
