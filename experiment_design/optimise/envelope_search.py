@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.constraints.limits import TOLERANCE, UNIT_SCALE
+from experiment_design.constraints.limits import UNIT_SCALE
 from experiment_design.excitation.rollout import Motion
 from experiment_design.information.envelope import HOLDS, Envelope
 from experiment_design.optimise.search import Candidate, limit_scale, to_unit
@@ -203,7 +203,7 @@ def exchange_settings(
     scale = np.append(limit_scale(problem), UNIT_SCALE[""])
 
     def better(found: list[tuple[Array, Candidate]]) -> list[tuple[Array, Candidate]]:
-        return sorted(found, key=lambda f: _rank(f[1], scale))[:_KEPT]
+        return sorted(found, key=lambda f: (f[1].shortfall(scale), -f[1].value))[:_KEPT]
 
     begun = judged(drawn(RANDOM, np.random.default_rng([41, seed])))
     rounds = max(2, round(_ROUNDS * effort))
@@ -239,12 +239,3 @@ def one_sided(envelope: Envelope, motion: Motion) -> Array:
 def _held(rng: np.random.Generator, longest: int) -> int:
     """Draw for how many holds a setting is kept, as often long as short in their logarithm."""
     return min(longest, max(1, int(np.exp(rng.uniform(0.0, np.log(longest + 1))))))
-
-
-def _rank(candidate: Candidate, scale: Array) -> tuple[float, float]:
-    """Return what candidates are ordered by: limits first, then the value."""
-    over = np.where(candidate.missed > TOLERANCE, candidate.missed, 0.0) / scale
-    short = float(over.sum()) if over.size else 0.0
-    if not np.isfinite(candidate.value):
-        short += 1e6
-    return short, -candidate.value
