@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +44,32 @@ EXAMPLES = """examples:
 
 # bytes of a polygon of 500 corners, many times over
 _LARGEST_ROOM = 1_000_000
-# what a trial may be designed for
-PURPOSES = ("coefficients", "prediction", "causes")
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """What a trial may be designed for.
+
+    Parameters
+    ----------
+    name : str
+        As ``--for`` takes it.
+    words : str
+        What the trial is for; empty where only its own options ask for it.
+    run : callable
+        Takes the options, the model, the vessel, what has been sailed or None and sentences on it,
+        designs the trial and writes it.
+    asked_by : tuple of str
+        Options that ask for it where ``--for`` is not given.
+    whole : bool
+        Whether the ship moves by a force without a name too, and not by coefficients alone.
+    """
+
+    name: str
+    words: str
+    run: Callable[[argparse.Namespace, Any, Any, Any, tuple[str, ...]], None]
+    asked_by: tuple[str, ...] = ()
+    whole: bool = False
 
 
 def _given(options: argparse.Namespace) -> set[str]:
@@ -59,18 +85,15 @@ def _given(options: argparse.Namespace) -> set[str]:
     return given
 
 
-def _purpose(options: argparse.Namespace, given: set[str]) -> str:
+def _purpose(options: argparse.Namespace, given: set[str]) -> Purpose:
     """Return what the trial is for, by --for or by options that ask for it themselves."""
-    if options.between or options.purpose:
-        return options.purpose or "coefficients"
-    if given & {"causes", "diagnosis"}:
-        return "causes"
-    return "coefficients" if given.intersection(COEFFICIENTS) else "prediction"
+    asked = (p for p in PURPOSES.values() if given.intersection(p.asked_by))
+    return PURPOSES[options.purpose] if options.purpose else next(asked, PURPOSES["prediction"])
 
 
 def _listed(registry: Registry[Any]) -> str:
     """Return the words of all entries, for a help text."""
-    *others, last = (entry.words for entry in registry.values())
+    *others, last = (entry.words for entry in registry.values() if entry.words)
     return f"{', '.join(others)}, or {last}"
 
 
@@ -159,11 +182,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     goal.add_argument(
         "--for",
         dest="purpose",
-        choices=PURPOSES,
-        help="what the trial is for: predictions to both sides over the operating envelope, "
-        "allowing for the misfit of the structure (prediction, unless one of "
-        f"{', '.join(map(spelt, COEFFICIENTS))} is given), the precision of coefficients in one "
-        "regime, or telling causes apart",
+        choices=tuple(n for n, purpose in PURPOSES.items() if purpose.words),
+        help=f"what the trial is for: {_listed(PURPOSES)} (prediction, unless one of "
+        f"{', '.join(map(spelt, COEFFICIENTS))} is given)",
     )
     goal.add_argument(
         "--diagnosis",
@@ -344,10 +365,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Read, design, write."""
-    from dataclasses import replace
-
-    from experiment_design.design import design_trial
-    from experiment_design.optimise.duration import least_duration
     from greybox.errors import UsageError
     from greybox.files import check_targets
     from greybox.model.model import load_model
@@ -371,7 +388,7 @@ def run(options: argparse.Namespace) -> None:
     untried = options.prior == NO_PRIOR
     given = _given(options)
     purpose = _purpose(options, given)
-    require_compatible(given if options.between else given | {f"for {purpose}"})
+    require_compatible(given if options.between else given | {f"for {purpose.name}"})
     if options.between is None and options.model is None and not untried and not options.after:
         raise UsageError(
             "--model is missing: name a prior model, two with --between A B, what has been sailed "
@@ -387,28 +404,25 @@ def run(options: argparse.Namespace) -> None:
         model = semi_empirical_model(vessel)
     else:
         model = load_model(options.between[0] if options.between else options.model)
-    if purpose == "prediction":
-        _run_for_prediction(options, model, vessel, sailed, told)
-        return
-    if not untried:
+    if not (untried or purpose.whole):
         model = model.coefficient_model()
-    if purpose == "causes":
-        _run_for_causes(options, model, vessel)
-        return
+    purpose.run(options, model, vessel, sailed, told)
+
+
+def _run_for_coefficients(
+    options: argparse.Namespace, model: Any, vessel: Any, sailed: Any, told: tuple[str, ...]
+) -> None:
+    """Design the trial that tells coefficients and write it."""
+    from dataclasses import replace
+
+    from experiment_design.design import design_trial
+    from experiment_design.optimise.duration import least_duration
+
     asked = _asked(options, model, sailed)
     if sailed is not None:
         asked = replace(asked, prior=model)
     request, _ = _prepared(options, model, asked, vessel, sailed)
     notes = (*told, *request.notes)
-    if options.between and options.model not in (None, options.between[0]):
-        notes = (
-            f"--between begins from its first model, {options.between[0]}, and {options.model} "
-            f"takes no part",
-            *notes,
-        )
-    if options.between:
-        _run_between(options, request, notes)
-        return
     if options.target:
         request = least_duration(
             request,
@@ -579,7 +593,9 @@ def _run_for_prediction(
     _deliver(options, found.design, found, notes, _of_sailed(sailed), found.headline())
 
 
-def _run_for_causes(options: argparse.Namespace, model: Any, vessel: Any) -> None:
+def _run_for_causes(
+    options: argparse.Namespace, model: Any, vessel: Any, sailed: Any, told: tuple[str, ...]
+) -> None:
     """Design the trial that tells causes apart and write it."""
     from experiment_design.for_causes import (
         AskedCauses,
@@ -637,7 +653,9 @@ def _range(text: str, vessel: Any) -> tuple[str, tuple[float, float]]:
     return name, (first, last)
 
 
-def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ...]) -> None:
+def _run_between(
+    options: argparse.Namespace, model: Any, vessel: Any, sailed: Any, told: tuple[str, ...]
+) -> None:
     """Design the trial between two models and write it."""
     from experiment_design.discriminate import design_between
     from experiment_design.request.request import CandidateModel, full_structure
@@ -648,6 +666,14 @@ def _run_between(options: argparse.Namespace, request: Any, notes: tuple[str, ..
     first, second = (Path(p).stem for p in options.between)
     if first == second:
         first, second = options.between
+    request, _ = _prepared(options, model, _asked(options, model), vessel, sailed)
+    notes = request.notes
+    if options.model not in (None, options.between[0]):
+        notes = (
+            f"--between begins from its first model, {options.between[0]}, and {options.model} "
+            f"takes no part",
+            *notes,
+        )
     other = load_model(options.between[1]).coefficient_model()
     if other.sample_time != request.sample_time:
         raise UsageError(
@@ -837,3 +863,24 @@ def read_area(path: str | Path) -> Any:
             f"needed."
         )
     return corners
+
+
+PURPOSES: Registry[Purpose] = Registry(
+    "purpose",
+    # T-optimality
+    Purpose("between", "", _run_between, ("between",)),
+    Purpose(
+        "prediction",
+        "predictions to both sides over the operating envelope, allowing for what the structure "
+        "lacks",
+        _run_for_prediction,
+        whole=True,
+    ),
+    Purpose("causes", "telling causes apart", _run_for_causes, ("causes", "diagnosis")),
+    Purpose(
+        "coefficients",
+        "the precision of coefficients in one regime",
+        _run_for_coefficients,
+        COEFFICIENTS,
+    ),
+)

@@ -25,7 +25,6 @@ from experiment_design.optimise.envelope_search import (
     VALIDATION,
     EnvelopeSearch,
     search_envelope,
-    validation_holds,
 )
 from experiment_design.optimise.lead_in import after_lead_in
 from experiment_design.output.result import Design, PlanPart
@@ -58,8 +57,8 @@ class PredictionDesign:
     ----------
     design : Design
     noise, misfit : dict of str to float
-        Root mean squared error of each state over the envelope [m/s, rad/s]: by noise in the
-        coefficients, and by what the structure lacks.
+        Root mean squared error of each state over the envelope [m/s, rad/s]: by noise, and by
+        forces beyond the prior's terms that the trial does not tell.
     random : float
         Root mean squared error of the median of random sequences of the same length, over
         that of the plan.
@@ -100,7 +99,7 @@ class PredictionDesign:
         error = ", ".join(f"{n} {np.hypot(self.noise[n], self.misfit[n]):.2g}" for n in self.noise)
         said = (
             f"After this trial predictions over the operating envelope are expected to be off by "
-            f"{error} (rms, m/s and rad/s, beside what no coefficient of this structure can mend); "
+            f"{error} (rms, m/s and rad/s, where the estimate chooses its terms by this trial); "
             f"after random steps of the same length by {self.random:.2f} times as much"
         )
         if self.design.request.untried:
@@ -127,8 +126,8 @@ class PredictionDesign:
             f"{r.duration:g} s for prediction, both sides, {ranges}",
             *(["planned without an estimated model, from main dimensions"] if r.untried else []),
             self.headline(),
-            f"the last {VALIDATION:.0%} of each trial are usual manoeuvres, a two-sided zig-zag "
-            f"and a turn, by which an estimate judges itself",
+            f"the last {VALIDATION:.0%} of each trial may judge an estimate that takes no part in "
+            f"it (--plan of greybox estimate)",
         ]
         if self.crossings:
             part = sum(b - a for a, b in self.crossings) / r.duration
@@ -308,8 +307,7 @@ def _design(
     )  # fmt: skip
     design = replace(design, parts=_parts(asked, design.parts))
     known = _sum(before, log_moments(found, design.motions[1:]))
-    noise, bias = found.errors(design.motions[0], known)
-    whole = np.sqrt(float((noise + bias).mean()))
+    noise, unknown = found.errors(design.motions[0], known)
     kept = searches[0].random[np.isfinite(searches[0].random)]
     usual = float(np.median(np.exp(-kept))) if len(kept) else float("nan")
     v = states.index("v") if "v" in states else None
@@ -321,8 +319,8 @@ def _design(
     return PredictionDesign(
         design,
         {s: float(np.sqrt(noise[0, i]) * found.spread[i]) for i, s in enumerate(states)},
-        {s: float(np.sqrt(bias[0, i]) * found.spread[i]) for i, s in enumerate(states)},
-        usual / whole if asked.trials == 1 else float("nan"),
+        {s: float(np.sqrt(unknown[0, i]) * found.spread[i]) for i, s in enumerate(states)},
+        usual * np.exp(searches[0].candidate.value) if asked.trials == 1 else float("nan"),
         {n: (float(a), float(b)) for n, a, b in
          zip(asked.schedule.commands, found.lower, found.upper, strict=True)},
         crossings,
@@ -338,10 +336,11 @@ def _of_start(start: str, kept: int, trials: int) -> tuple[str, ...]:
 
 
 def _parts(request: PreparedRequest, led: tuple[PlanPart, ...]) -> tuple[PlanPart, ...]:
-    """Return what leads in, what is sailed for the estimate, and the usual manoeuvres behind it."""
+    """Return what leads in, what is sailed for the estimate, and the part that may judge it."""
     holds = request.schedule.holds
     first = 0.0 if request.lead_in is None else request.lead_in.seconds
-    begin, last = first + (holds - validation_holds(holds)) * request.hold, first + request.duration
+    begin = first + (holds - round(VALIDATION * holds)) * request.hold
+    last = first + request.duration
     if begin >= last:
         return led
     spans = ((TRIAL, first, begin), (VALIDATION_PART, begin, last))

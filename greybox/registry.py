@@ -38,8 +38,8 @@ class Registry(Mapping[str, T]):
     entries : tuple
         Those that are known at once.
     package : str
-        Package whose modules each hold one entry more, as ``ENTRY``, in the order of
-        their ``ENTRY.order`` where it has one.
+        Package whose modules each hold one entry more, as ``ENTRY``, or several as
+        ``ENTRIES``, in the order of their ``order`` where they have one.
     group : str
         Group of entry points by which other distributions add theirs.
     error : type
@@ -64,10 +64,9 @@ class Registry(Mapping[str, T]):
             found: list[T] = []
             if self._package:
                 package = import_module(self._package)
-                found += [
-                    import_module(f"{self._package}.{m.name}").ENTRY
-                    for m in iter_modules(package.__path__)
-                ]
+                for m in iter_modules(package.__path__):
+                    module = import_module(f"{self._package}.{m.name}")
+                    found += getattr(module, "ENTRIES", None) or (module.ENTRY,)
                 found.sort(key=lambda e: int(getattr(e, "order", 0)))
             if self._group:
                 found += [point.load() for point in metadata.entry_points(group=self._group)]

@@ -27,8 +27,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
+from experiment_design.certificate.mixture import best_weights
 from experiment_design.certificate.surge_bound import bound_surge, why_not_surge
 from experiment_design.certificate.trajectory_bound import (
     TrajectoryBound,
@@ -309,26 +309,12 @@ def _mixture(pools: list[_Pool], weights: list[Array]) -> Array:
 
 def _best_weights(outer: Criterion, pools: list[_Pool], weights: list[Array]) -> list[Array]:
     """Return the weights that maximise the criterion of the mixture, each trial's sum one."""
-    ends = np.cumsum([len(w) for w in weights])[:-1]
 
-    def shares(flat: Array) -> list[Array]:
-        parts = [np.exp(x - x.max()) for x in np.split(flat, ends)]
-        return [p / p.sum() for p in parts]
-
-    def cost(flat: Array) -> tuple[float, Array]:
-        parts = shares(flat)
+    def worth(parts: list[Array]) -> tuple[float, list[Array]]:
         value, slope = _concave(outer, _mixture(pools, parts))
-        if not np.isfinite(value):
-            return 1e6, np.zeros_like(flat)
-        gradient = []
-        for pool, w in zip(pools, parts, strict=True):
-            g = np.einsum("ij,rij->r", slope, pool.info)
-            gradient.append(-w * (g - w @ g))
-        return -value, np.concatenate(gradient)
+        return value, [np.einsum("ij,rij->r", slope, pool.info) for pool in pools]
 
-    start = np.log(np.maximum(np.concatenate(weights), 1e-6))
-    result = minimize(cost, start, jac=True, method="L-BFGS-B", options={"maxiter": 150})
-    return shares(result.x)
+    return best_weights(worth, weights, 150)
 
 
 def _bound_hull(

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
+from experiment_design.certificate.mixture import best_weights
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.information.moments import MomentProgram, Moments
 from experiment_design.request.problem import TrialProblem
@@ -339,20 +339,10 @@ def _improve(
 def _weights(trial: _Trial, gram: Array, score: Array, weights: Array) -> Array:
     """Return weights of sums (n, q, q) that maximise the criterion from given ones."""
 
-    def shares(flat: Array) -> Array:
-        w = np.exp(flat - flat.max())
-        return np.asarray(w / w.sum())
+    def worth(parts: list[Array]) -> tuple[float, list[Array]]:
+        mixed = _Sums(np.tensordot(parts[0], gram, 1), np.tensordot(parts[0], score, 1))
+        value, slope = trial.value(mixed)
+        along = np.einsum("ij,rij->r", slope.gram, gram)
+        return value, [along + np.einsum("ij,rij->r", slope.score_covariance, score)]
 
-    def cost(flat: Array) -> tuple[float, Array]:
-        w = shares(flat)
-        value, slope = trial.value(_Sums(np.tensordot(w, gram, 1), np.tensordot(w, score, 1)))
-        if not np.isfinite(value):
-            return 1e6, np.zeros_like(flat)
-        g = np.einsum("ij,rij->r", slope.gram, gram) + np.einsum(
-            "ij,rij->r", slope.score_covariance, score
-        )
-        return -value, -w * (g - w @ g)
-
-    start = np.log(np.maximum(weights, 1e-6))
-    result = minimize(cost, start, jac=True, method="L-BFGS-B", options={"maxiter": 80})
-    return shares(result.x)
+    return best_weights(worth, [weights], 80)[0]

@@ -36,10 +36,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.optimize import minimize
 from scipy.sparse import csr_matrix
 from scipy.spatial import ConvexHull
 
+from experiment_design.certificate.mixture import best_weights
 from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.information.moments import MomentProgram, Moments
@@ -767,20 +767,10 @@ class _Mixture:
     def _renew(self) -> None:
         """Give the sequences the weights that maximise the criterion."""
 
-        def shares(flat: Array) -> Array:
-            w = np.exp(flat - flat.max())
-            return np.asarray(w / w.sum())
+        def worth(parts: list[Array]) -> tuple[float, list[Array]]:
+            value, slope = self.trial.value(parts[0] @ self.sums, self.chord)
+            return value, [self.sums @ slope]
 
-        def cost(flat: Array) -> tuple[float, Array]:
-            w = shares(flat)
-            value, slope = self.trial.value(w @ self.sums, self.chord)
-            if not np.isfinite(value):
-                return 1e6, np.zeros_like(flat)
-            g = self.sums @ slope
-            return -value, -w * (g - w @ g)
-
-        start = np.log(np.maximum(self.weights, 1e-5))
-        result = minimize(cost, start, jac=True, method="L-BFGS-B", options={"maxiter": 100})
-        weights = shares(result.x)
+        weights = best_weights(worth, [self.weights], 100, least=1e-5)[0]
         keep = weights > 1e-7
         self.sums, self.weights = self.sums[keep], weights[keep] / weights[keep].sum()

@@ -1,14 +1,14 @@
 """Optimality criteria by name: the function of the wanted parameters' covariance to minimise.
 
 Every criterion is a number that grows with the information, in logarithms, so that
-they share one scale. A new one is a file of `kinds` with its entry, or an entry point.
+they share one scale. Another distribution adds its own by an entry point.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from greybox.registry import Registry
 
@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
+
+
+# exponent of the norm that stands for the largest eigenvalue while climbing
+_SHARP = 8
 
 
 @dataclass(frozen=True)
@@ -32,13 +36,14 @@ class Optimality(ABC):
         As ``--criterion`` takes it.
     words : str
         What it looks at.
-    order : int
-        Among those that are shown.
     """
 
     name: str
     words: str
-    order: int = 9
+    # whether it is −log det: of one variance for each parameter together
+    determinant: ClassVar[bool] = False
+    # whether it looks at one combination of the parameters
+    combined: ClassVar[bool] = False
 
     @abstractmethod
     def of_covariance(self, c: Array, scale: Array, combination: Array) -> Array:
@@ -64,16 +69,6 @@ class Optimality(ABC):
         """Return how many variances it counts together: a gain over that is one of time."""
         return size if self.determinant else 1
 
-    @property
-    def determinant(self) -> bool:
-        """Whether it is −log det: of one variance for each parameter together."""
-        return False
-
-    @property
-    def combined(self) -> bool:
-        """Whether it looks at one combination of the parameters."""
-        return False
-
 
 class SumOfVariances(Optimality):
     """−log of the sum of the variances along some directions."""
@@ -95,8 +90,76 @@ class SumOfVariances(Optimality):
         return -(along.T @ along) / float((along @ c * along).sum())
 
 
+class _Combination(SumOfVariances):
+    """−log of the variance of one combination."""
+
+    combined = True
+
+    def directions(self, scale: Array, combination: Array) -> Array:
+        return combination[None]
+
+
+class _Trace(SumOfVariances):
+    """−log of the mean relative variance."""
+
+    def directions(self, scale: Array, combination: Array) -> Array:
+        import numpy as np
+
+        return np.diag(1 / (scale * np.sqrt(len(scale))))
+
+
+class _Determinant(Optimality):
+    """−log det C."""
+
+    determinant = True
+
+    def of_covariance(self, c: Array, scale: Array, combination: Array) -> Array:
+        from greybox.numerics.linalg import scaled_logdet
+
+        return -scaled_logdet(c)
+
+    def slope(self, c: Array, scale: Array, combination: Array) -> Array:
+        from greybox.numerics.linalg import scaled_inverse
+
+        return -scaled_inverse(c)
+
+
+class _Largest(Optimality):
+    """−log of the largest relative variance, climbed as −log of a norm of the eigenvalues."""
+
+    def of_covariance(self, c: Array, scale: Array, combination: Array) -> Array:
+        import numpy as np
+
+        relative = c / np.outer(scale, scale)
+        return np.asarray(-np.log(np.linalg.eigvalsh(relative)[:, -1]))
+
+    def slope(self, c: Array, scale: Array, combination: Array) -> Array:
+        import numpy as np
+
+        outer = np.outer(scale, scale)
+        values, vectors = np.linalg.eigh(c / outer)
+        share = values / values[-1]
+        power = share ** (_SHARP - 1) / (share**_SHARP).sum() / values[-1]
+        return np.asarray(-(vectors * power) @ vectors.T / outer)
+
+    def climbed(self, c: Array, scale: Array, combination: Array) -> float:
+        import numpy as np
+
+        values = np.linalg.eigh(c / np.outer(scale, scale))[0]
+        share = values / values[-1]
+        return float(-np.log(values[-1]) - np.log((share**_SHARP).sum()) / _SHARP)
+
+    def slack(self, size: int) -> float:
+        import numpy as np
+
+        return float(np.log(size) / _SHARP)
+
+
 CRITERIA: Registry[Optimality] = Registry(
     "criterion",
-    package="experiment_design.criteria.kinds",
+    _Determinant("D", "determinant"),
+    _Trace("A", "relative trace"),
+    _Largest("E", "worst direction"),
+    _Combination("c", "one function --of them"),
     group="experiment_design.criteria",
 )

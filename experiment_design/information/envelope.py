@@ -2,25 +2,21 @@
 
 No real ship is in the family of its prior model. What the terms do not say is a smooth force of
 motion and commands: in each equation potential terms g stand beside the primary terms φ, with a
-prior variance (DuMouchel and Jones, 1994). A trial with the moments G = Σ [φ; g][φ; g]ᵀ leaves
-coefficients that are off by
+prior variance τ² (DuMouchel and Jones, 1994). An estimate chooses its terms by the log, so where
+a trial has been it follows this force, and elsewhere it does not know it. With the sensitivities
+S of the trial's free run in the coefficients of both, output errors of variance σ² and the
+prior's precision Λ, 0 and 1/τ², the trial leaves coefficients whose covariance is
 
-    noise    σ² G₁₁⁻¹,
-    misfit   (G₁₁⁻¹ G₁₂ − P) β,   P = W₁₁⁻¹ W₁₂,
+    C = (G + Λ)⁻¹ = C G C + C Λ C,   G = Σ Sᵀ S / σ²,
 
-where β are the coefficients of the potential terms and P what the best coefficients for the
-envelope make of them. W are the moments of the sensitivities of free runs over the envelope, so
-the mean squared error of predicted motion, variance plus squared bias (Box and Draper, 1959), is
-
-    σ² tr W₁₁ G₁₁⁻¹ + τ² tr Dᵀ W₁₁ D,   D = G₁₁⁻¹ G₁₂ − P,
-
-and what no coefficient can mend, which no trial changes. The second part is small where the
-trial moves as the ship will be used, the first where it moves much and long.
+of which the first part is by noise and the second what the trial does not tell. W are the moments
+of the sensitivities of free runs over the envelope, so the mean squared error of predicted motion
+is tr W C: small where the trial moves as the ship will be used, much and long.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -46,13 +42,15 @@ HOLDS = (0.5, 6.0)
 # centres of the potential terms
 _CENTRES = 40
 # samples of a motion that its moments are summed over
-_SAMPLES = 400
+_SAMPLES = 160
 # share of the settings that count as straight, and how often one of these is held
 _STRAIGHT, _COURSE = 0.1, 0.25
 # speed at the start, as a share of the fastest straight motion
-_APPROACH = 0.9
+_APPROACH = 1.0
 # slowest and fastest steady motion that counts, in what the prior's trial showed
-_SLOWEST, _FASTEST = 0.7, 1.3
+_SLOWEST, _FASTEST = 0.55, 1.3
+# what not even the potential terms say, as a share of the spread of each state
+_UNSAID = 0.05
 # share of the commands under which the prior must hold the ship
 HELD = 0.25
 # least misfit, as a share of the spread of each state
@@ -70,7 +68,7 @@ class Envelope:
     predictor : Predictor
         Whose columns are the primary terms.
     variance : ndarray
-        (nx,) of the equation errors a sample, without the misfit.
+        (nx,) of the output error at a sample, counted as if each were new.
     lower, upper : ndarray
         (nc,) range of each command.
     settings : ndarray
@@ -100,8 +98,7 @@ class Envelope:
     spread: Array
     _features: _Features = field(repr=False)
     _moments: tuple[Array, ...] = field(repr=False)
-    _best: Array = field(repr=False)
-    _tau: Array = field(repr=False)
+    _precision: Array = field(repr=False)
 
     def errors(self, motion: Motion, known: Array | None = None) -> tuple[Array, Array]:
         """Return the prediction errors that remain after estimates from R motions.
@@ -110,62 +107,71 @@ class Envelope:
         ----------
         motion : Motion
         known : ndarray, optional
-            (p, p) moments of other trials, as `information` gives them.
+            (p + q, p + q) moments of other trials, as `information` gives them.
 
         Returns
         -------
         tuple of ndarray
-            (R, nx) mean squared error of each state by noise, and by misfit, in the variance
-            of the state; inf where a run is unstable or a term not excited.
+            (R, nx) mean squared error of each state by noise, and by forces that the trial does
+            not tell, in the variance of the state; inf where a run is unstable or a term not
+            excited.
         """
-        runs, nx = len(motion.state), self.rollout.nx
-        noise, bias = np.full((runs, nx), np.inf), np.full((runs, nx), np.inf)
-        good = np.flatnonzero(motion.stable)
-        if not len(good):
-            return noise, bias
-        gram = self.information(motion, good)
-        if known is not None:
-            gram = gram + known
-        p = len(self.predictor.columns)
-        own = gram[:, :p, :p]
-        size = np.sqrt(np.maximum(np.diagonal(own, axis1=1, axis2=2), 0.0))
-        excited = (size > 0).all(axis=1)
-        good, gram, size = good[excited], gram[excited], size[excited]
-        if not len(good):
-            return noise, bias
+        noise, unknown = np.full((2, len(motion.state), self.rollout.nx), np.inf)
+        good, (gram,) = self._telling(motion, 1)
+        left = self._covariance(gram, known)
+        by_prior = left * self._precision @ left
+        for i, w in enumerate(self._moments):
+            noise[good, i] = np.einsum("ab,rab->r", w, left - by_prior)
+            unknown[good, i] = np.einsum("ab,rab->r", w, by_prior)
+        return noise, unknown
+
+    def error_without_parts(self, motion: Motion, known: Array | None, parts: int) -> Array:
+        """Return the error (R,) of both kinds with contiguous parts of R motions left out in turn.
+
+        The mean over them and over the states; see `errors`.
+        """
+        found = np.full(len(motion.state), np.inf)
+        good, grams = self._telling(motion, parts)
+        found[good] = 0.0
+        whole, w = grams.sum(axis=0), np.mean(self._moments, axis=0)
+        for part in grams:
+            left = self._covariance(whole - part, known)
+            found[good] += np.einsum("ab,rab->r", w, left) / parts
+        return found
+
+    def _covariance(self, gram: Array, known: Array | None) -> Array:
+        """Return the covariance (R, m, m) of coefficients that moments and the prior leave."""
+        gram = gram + np.diag(self._precision) + (0.0 if known is None else known)
+        size = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
         outer = size[:, :, None] * size[:, None, :]
         # a direction that is hardly excited stays what the prior says it is
-        inverse = np.linalg.inv(gram[:, :p, :p] / outer + 1e-9 * np.eye(p)) / outer
-        per_column = np.concatenate(
-            [np.full(len(self.predictor.equation(n)), v) for n, v in
-             zip(self.rollout.structure.states, self.variance, strict=True)]
-        )  # fmt: skip
-        off = inverse @ gram[:, :p, p:] - self._best
-        for i, w in enumerate(self._moments):
-            # equations do not share columns, so that the inverse is block by block
-            noise[good, i] = np.einsum("ab,rab,b->r", w[:p, :p], inverse, per_column)
-            bias[good, i] = np.einsum("rab,ac,rcb,b->r", off, w[:p, :p], off, self._tau)
-        return noise, bias
+        return np.asarray(np.linalg.inv(gram / outer + 1e-9 * np.eye(size.shape[1])) / outer)
 
-    def information(self, motion: Motion, which: NDArray[np.intp] | None = None) -> Array:
-        """Return the moments G (R, p + q, p + q) of primary and potential terms."""
-        nx = self.rollout.nx
-        which = np.arange(len(motion.state)) if which is None else which
-        every = max(1, motion.tau.shape[1] // _SAMPLES)
-        x = motion.state[which][:, :-1:every]
-        z, g = self._features(
-            x[..., :nx], x[..., nx], motion.tau[which][:, ::every],
-            motion.commands[which][:, ::every],
-        )  # fmt: skip
-        z, g = np.moveaxis(z, 0, 1), np.moveaxis(g, 0, 1)
-        p, k = z.shape[1], g.shape[1]
-        gram = np.zeros((len(which), p + nx * k, p + nx * k))
-        for i, name in enumerate(self.rollout.structure.states):
-            rows = self.predictor.equation(name)
-            both = np.concatenate([z[:, rows], g], axis=1)
-            at = np.array([*rows, *range(p + i * k, p + (i + 1) * k)])
-            gram[:, at[:, None], at] = every * (both @ both.transpose(0, 2, 1))
-        return gram
+    def information(self, motion: Motion) -> Array:
+        """Return what output error tells of primary and potential terms, G (R, p + q, p + q)."""
+        return np.asarray(self._by_part(motion, np.arange(len(motion.state)), 1)[0])
+
+    def _telling(self, motion: Motion, parts: int) -> tuple[NDArray[np.intp], Array]:
+        """Return which runs tell all primary terms, and the information of their parts."""
+        stable = np.flatnonzero(motion.stable)
+        grams = self._by_part(motion, stable, parts)
+        whole = grams.sum(axis=0)
+        size = np.diagonal(whole, axis1=1, axis2=2)[:, : len(self.predictor.columns)]
+        excited = np.isfinite(whole).all(axis=(1, 2)) & (size > 0).all(axis=1)
+        return stable[excited], grams[:, excited]
+
+    def _by_part(self, motion: Motion, which: NDArray[np.intp], parts: int) -> Array:
+        """Return the information of each contiguous part of some runs, (parts, R, m, m)."""
+        motion = Motion(
+            motion.state[which], motion.tau[which], motion.commands[which], motion.stable[which]
+        )
+        rows, every = _sensitivities(self.rollout, self.predictor, self._features, motion)
+        s = np.stack(list(rows), axis=1) / np.sqrt(self.variance)[:, None]
+        told = [
+            part.reshape(len(which), part.shape[1] * part.shape[2], part.shape[3])
+            for part in np.array_split(s, parts, axis=1)
+        ]
+        return every * np.array([part.transpose(0, 2, 1) @ part for part in told])
 
     def pick(self, rng: np.random.Generator) -> Array:
         """Draw one setting (nc,): any, or now and then one that holds a course."""
@@ -227,6 +233,7 @@ class _Features:
         values, vectors = np.linalg.eigh(self._kernel(self._centres))
         kept = values > 1e-6 * values[-1]
         self._root = vectors[:, kept] / np.sqrt(values[kept])
+        self.size = self._root.shape[1]
 
     def _kernel(self, signals: Array) -> Array:
         square = ((signals**2).sum(axis=-1)[..., None] + (self._centres**2).sum(axis=1)
@@ -326,58 +333,76 @@ def build_envelope(
     x = motion.state[:, :-1, :nx]
     signals = np.concatenate([x, motion.commands], axis=-1)
     features = _Features(rollout, predictor, signals.reshape(-1, signals.shape[-1])[::7], seed)
-    moments = _sensitivity_moments(rollout, predictor, features, motion, int(_RUN * scale / dt))
-    p = len(predictor.columns)
-    total = sum(moments)
+    rows, _ = _sensitivities(rollout, predictor, features, motion, int(_RUN * scale / dt))
+    spread = x.reshape(-1, nx).std(axis=0)
+    spread[spread == 0] = 1.0
+    s = np.stack(list(rows)).reshape(-1, nx, len(predictor.columns) + nx * features.size)
+    moments = tuple(s[:, i].T @ s[:, i] / (len(s) * spread[i] ** 2) for i in range(nx))
+    share = np.maximum(misfit, _LEAST_MISFIT)
+    tau = _prior_variance(moments, len(predictor.columns), share)
+    # an error of a step lasts about a time scale, and so does what no term says
+    lasting = scale / dt
+    by_step = lasting * np.asarray(noise.process, float) ** 2 + (_UNSAID * spread) ** 2
+    variance = np.asarray(noise.measurement, float) ** 2 + lasting * by_step
+    precision = np.concatenate([np.zeros(len(predictor.columns)), 1 / tau])
+    return Envelope(
+        rollout, predictor, variance, lower, upper, settings, steady, straight, scale, share,
+        spread, features, moments, precision,
+    )  # fmt: skip
+
+
+def _sensitivities(
+    rollout: Rollout,
+    predictor: Predictor,
+    features: _Features,
+    motion: Motion,
+    run: int | None = None,
+) -> tuple[Iterator[Array], int]:
+    """Return sensitivities (R, nx, p + q) of free runs in turn, and samples from one to the next.
+
+    A free run begins anew after `run` samples, by default never. Between two of them the slopes
+    and terms of the first stand.
+    """
+    nx, states, samples = rollout.nx, rollout.structure.states, motion.tau.shape[1]
+    every = max(1, samples // _SAMPLES)
+    at = np.arange(0, samples, every)
+    x, tau, commands = motion.state[:, at], motion.tau[:, at], motion.commands[:, at]
+    z, g = features(x[..., :nx], x[..., nx], tau, commands)
+    thinned = Motion(motion.state[:, [*at, -1]], tau, commands, motion.stable)
+    slopes = rollout.slopes(thinned)[:nx, :nx].transpose(3, 2, 0, 1)
+    over, gained = np.broadcast_to(np.eye(nx), slopes.shape), np.zeros(slopes.shape)
+    for _ in range(every):
+        over, gained = slopes @ over, gained + over
+    p, k = len(z), len(g)
+
+    def walk() -> Iterator[Array]:
+        s, pushed = np.zeros((2, len(x), nx, p + nx * k))
+        for j in range(len(at)):
+            for i, name in enumerate(states):
+                rows = predictor.equation(name)
+                pushed[:, i, rows] = z[rows, :, j].T
+                pushed[:, i, p + i * k : p + (i + 1) * k] = g[:, :, j].T
+            begins = run is not None and j % max(1, run // every) == 0
+            s = gained[j] @ pushed + (0.0 if begins else over[j] @ s)
+            yield s
+
+    return walk(), every
+
+
+def _prior_variance(moments: tuple[Array, ...], p: int, share: Array) -> Array:
+    """Return the variance (q,) of the potential terms' coefficients, one for each equation.
+
+    With it the best coefficients of the p primary terms leave the misfit that the prior has shown.
+    """
+    from scipy.optimize import nnls
+
+    total, nx = np.sum(moments, axis=0), len(moments)
     size = np.sqrt(np.diag(total))
     size[size == 0] = 1.0
     unit = total / np.outer(size, size)
     best = np.linalg.solve(unit[:p, :p] + 1e-9 * np.eye(p), unit[:p, p:])
     best = best * size[p:] / size[:p, None]
-    share = np.maximum(misfit, _LEAST_MISFIT)
-    tau = _prior_variance(moments, best, share, nx)
-    variance = np.asarray(noise.process, float) ** 2 + 2 * np.asarray(noise.measurement) ** 2
-    return Envelope(
-        rollout, predictor, variance, lower, upper, settings, steady, straight, scale, share,
-        x.reshape(-1, nx).std(axis=0), features, moments, best, tau,
-    )  # fmt: skip
-
-
-def _sensitivity_moments(
-    rollout: Rollout, predictor: Predictor, features: _Features, motion: Motion, run: int
-) -> tuple[Array, ...]:
-    """Return the mean of S Sᵀ of each state in its variance, (p + q, p + q) each."""
-    nx, states = rollout.nx, rollout.structure.states
-    x = motion.state[:, :-1]
-    z, g = features(x[..., :nx], x[..., nx], motion.tau, motion.commands)
-    slopes = rollout.slopes(motion)[:nx, :nx]
-    p, k = len(z), len(g)
-    variance = x[..., :nx].reshape(-1, nx).var(axis=0)
-    variance[variance == 0] = 1.0
-    s = np.zeros((len(x), nx, p + nx * k))
-    total = [np.zeros((p + nx * k, p + nx * k)) for _ in states]
-    for j in range(x.shape[1]):
-        if j % run == 0:
-            s[:] = 0.0
-        s = slopes[:, :, :, j].transpose(2, 0, 1) @ s
-        for i, name in enumerate(states):
-            rows = predictor.equation(name)
-            s[:, i, rows] += z[rows, :, j].T
-            s[:, i, p + i * k : p + (i + 1) * k] += g[:, :, j].T
-        for i in range(nx):
-            total[i] += s[:, i].T @ s[:, i] / variance[i]
-    return tuple(t / (len(x) * x.shape[1]) for t in total)
-
-
-def _prior_variance(moments: tuple[Array, ...], best: Array, share: Array, nx: int) -> Array:
-    """Return the variance (q,) of the potential terms' coefficients, one for each equation.
-
-    With it the best coefficients for the envelope leave the misfit that the prior has shown.
-    """
-    from scipy.optimize import nnls
-
-    p = len(best)
-    k = (len(moments[0]) - p) // nx
+    k = (len(total) - p) // nx
     left = np.empty((nx, nx))
     for i, w in enumerate(moments):
         rest = w[p:, p:] - best.T @ w[:p, p:] - w[p:, :p] @ best + best.T @ w[:p, :p] @ best

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.constraints.limits import TOLERANCE, UNIT_SCALE
+from experiment_design.constraints.limits import UNIT_SCALE
 from experiment_design.excitation.rollout import Motion
 from experiment_design.information.envelope import HOLDS, Envelope
 from experiment_design.optimise.search import Candidate, limit_scale, to_unit
@@ -24,9 +24,11 @@ Array = NDArray[np.float64]
 
 # random sequences that a search begins with, and that a plan is compared with
 RANDOM = 200
-# share of the trial that is kept for usual manoeuvres: by the last third of a log an estimate
-# chooses its terms
+# share of the trial by which an estimate may be judged that it takes no part in
 VALIDATION = 1 / 3
+# parts of a trial: an estimate chooses its terms by leaving out each of as many in turn, and what
+# is left must tell what the part that is left out shows
+_PARTS = 4
 _CHAINS, _KEPT, _TOGETHER, _ROUNDS = 4, 12, 64, 14
 # of the largest steady yaw rate: how hard the zig-zag turns; time scales of each of its legs
 _TURN, _LEG = 0.6, 3.0
@@ -95,11 +97,6 @@ def usual_manoeuvres(envelope: Envelope, holds: int, hold: float) -> Array:
     return np.asarray(whole[:holds])
 
 
-def validation_holds(holds: int) -> int:
-    """Return how many of a trial's holds, its last, are usual manoeuvres."""
-    return round(VALIDATION * holds)
-
-
 def search_envelope(
     problem: TrialProblem,
     envelope: Envelope,
@@ -125,16 +122,10 @@ def search_envelope(
     """
 
     def worth(motion: Motion) -> Array:
-        noise, bias = envelope.errors(motion, known)
         with np.errstate(divide="ignore"):
-            return np.asarray(-0.5 * np.log((noise + bias).mean(axis=1)))
+            return np.asarray(-0.5 * np.log(envelope.error_without_parts(motion, known, _PARTS)))
 
-    holds = problem.shape[0]
-    hold = problem.schedule.hold * problem.schedule.sample_time
-    tail = usual_manoeuvres(envelope, validation_holds(holds), hold)
-    return exchange_settings(
-        problem, envelope, worth, seed, effort=effort, tail=tail, workers=workers
-    )
+    return exchange_settings(problem, envelope, worth, seed, effort=effort, workers=workers)
 
 
 def exchange_settings(
@@ -144,7 +135,6 @@ def exchange_settings(
     seed: int,
     *,
     effort: float = 1.0,
-    tail: Array | None = None,
     tries: int = _TOGETHER,
     workers: int | None = None,
 ) -> EnvelopeSearch:
@@ -160,8 +150,6 @@ def exchange_settings(
     seed : int
     effort : float
         Times the usual number of rounds.
-    tail : ndarray, optional
-        (k, nc) levels that every sequence ends with.
     tries : int
         Sequences that each round of each chain tries.
     workers : int, optional
@@ -169,19 +157,13 @@ def exchange_settings(
     """
     holds = problem.shape[0]
     hold = problem.schedule.hold * problem.schedule.sample_time
-    end = np.zeros((0, problem.shape[1])) if tail is None else tail
-    free = holds - len(end)
-    longest = max(1, min(free, round(HOLDS[1] * envelope.time_scale / hold)))
-
-    def whole(levels: Array) -> Array:
-        both = np.concatenate([levels, np.broadcast_to(end, (len(levels), *end.shape))], axis=1)
-        return problem.schedule.within_reach(both)
+    longest = max(1, min(holds, round(HOLDS[1] * envelope.time_scale / hold)))
 
     def judged(levels: Array) -> list[tuple[Array, Candidate]]:
         out = []
         for first in range(0, len(levels), _TOGETHER):
             part = levels[first : first + _TOGETHER]
-            complete = whole(part)
+            complete = problem.schedule.within_reach(part)
             motion = problem.scenarios[0].rollout.run(problem.schedule.expand(complete))
             value = worth(motion)
             missed = problem.scenarios[0].limits.violations(motion)
@@ -195,10 +177,10 @@ def exchange_settings(
         return out
 
     def drawn(count: int, rng: np.random.Generator) -> Array:
-        out = np.empty((count, free, len(problem.schedule.commands)))
+        out = np.empty((count, holds, len(problem.schedule.commands)))
         for levels in out:
             k = 0
-            while k < free:
+            while k < holds:
                 held = _held(rng, longest)
                 levels[k : k + held] = envelope.pick(rng)
                 k += held
@@ -208,11 +190,11 @@ def exchange_settings(
         out = levels.copy()
         for _ in range(int(rng.integers(1, 4))):
             held = _held(rng, longest)
-            i = int(rng.integers(free - held + 1))
+            i = int(rng.integers(holds - held + 1))
             if rng.random() < _ANEW:
                 out[i : i + held] = envelope.pick(rng)
             else:
-                j = int(rng.integers(free - held + 1))
+                j = int(rng.integers(holds - held + 1))
                 out[i : i + held], out[j : j + held] = (
                     out[j : j + held].copy(), out[i : i + held].copy(),
                 )  # fmt: skip
@@ -221,7 +203,7 @@ def exchange_settings(
     scale = np.append(limit_scale(problem), UNIT_SCALE[""])
 
     def better(found: list[tuple[Array, Candidate]]) -> list[tuple[Array, Candidate]]:
-        return sorted(found, key=lambda f: _rank(f[1], scale))[:_KEPT]
+        return sorted(found, key=lambda f: (f[1].shortfall(scale), -f[1].value))[:_KEPT]
 
     begun = judged(drawn(RANDOM, np.random.default_rng([41, seed])))
     rounds = max(2, round(_ROUNDS * effort))
@@ -257,12 +239,3 @@ def one_sided(envelope: Envelope, motion: Motion) -> Array:
 def _held(rng: np.random.Generator, longest: int) -> int:
     """Draw for how many holds a setting is kept, as often long as short in their logarithm."""
     return min(longest, max(1, int(np.exp(rng.uniform(0.0, np.log(longest + 1))))))
-
-
-def _rank(candidate: Candidate, scale: Array) -> tuple[float, float]:
-    """Return what candidates are ordered by: limits first, then the value."""
-    over = np.where(candidate.missed > TOLERANCE, candidate.missed, 0.0) / scale
-    short = float(over.sum()) if over.size else 0.0
-    if not np.isfinite(candidate.value):
-        short += 1e6
-    return short, -candidate.value

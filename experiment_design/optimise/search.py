@@ -64,12 +64,13 @@ class Candidate:
         """Whether this one is to be preferred: kept limits first, then the value."""
         if other is None:
             return True
-        mine, theirs = self._shortfall(scale), other._shortfall(scale)
+        mine, theirs = self.shortfall(scale), other.shortfall(scale)
         if mine == theirs == 0.0:
             return self.value > other.value
         return mine < theirs
 
-    def _shortfall(self, scale: Array) -> float:
+    def shortfall(self, scale: Array) -> float:
+        """Return by how much limits are missed, in their units (m,) added up."""
         over = np.where(self.missed > TOLERANCE, self.missed, 0.0) / scale
         total = float(over.sum()) if over.size else 0.0
         return total if np.isfinite(self.value) else total + 1e6

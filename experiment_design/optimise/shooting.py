@@ -28,9 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from experiment_design.constraints.kinds.end_state import EndState
-from experiment_design.constraints.kinds.energy import Energy
-from experiment_design.constraints.kinds.headings import HeadingRange
+from experiment_design.constraints.kinds.whole_trial import EndState, Energy, HeadingRange
 from experiment_design.constraints.limits import UNIT_SCALE
 from experiment_design.optimise.logdet import Affine, LogDet, determinant_factor
 from experiment_design.optimise.sparse_assembly import Gatherer, Index, coordinates, to_dm

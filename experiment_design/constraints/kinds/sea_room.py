@@ -157,4 +157,4 @@ def edge_distance(area: Array | Circle, north: Array, east: Array) -> Array:
     return np.asarray(inside(pair, np.empty((1, *shape)))[0])
 
 
-ENTRY = SeaRoom
+ENTRIES = (SeaRoom,)

@@ -1,1 +1,0 @@
-"""Optimality criteria of the covariance, one file each."""
