@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,16 +143,18 @@ def _block_matrices(
 
     ``own`` (k, k, L, L) from samples to outputs, ``entering`` (n, L) from the state to outputs,
     ``leaving`` (k, k, L, n) from samples to the state after the block, ``carried`` (n, n) from the
-    state to that state; of the transposed direct form.
+    state to that state. The state is that of the transposed direct form, turned so that it is as
+    large as what it leads to: near a pole of one the other cancels digits.
     """
-    a = np.frombuffer(denominator)
-    b = np.frombuffer(numerators).reshape(channels, channels, len(a))
+    a = np.frombuffer(denominator).astype(np.longdouble)
+    b = np.frombuffer(numerators).astype(np.longdouble).reshape(channels, channels, len(a))
     size = len(a) - 1
-    step = np.eye(size, k=1)
+    step = np.eye(size, k=1, dtype=np.longdouble)
     step[:, 0] -= a[1:]
     first = b[:, :, 1:] - b[:, :, :1] * a[1:]
-    entering, leaving = np.empty((size, _AT_ONCE)), np.empty((*b.shape[:2], _AT_ONCE, size))
-    power = np.eye(size)
+    entering = np.empty((size, _AT_ONCE), np.longdouble)
+    leaving = np.empty((*b.shape[:2], _AT_ONCE, size), np.longdouble)
+    power = np.eye(size, dtype=np.longdouble)
     for k in range(_AT_ONCE):
         entering[:, k] = power[0]
         leaving[:, :, _AT_ONCE - 1 - k] = first @ power.T
@@ -160,7 +163,31 @@ def _block_matrices(
     response = np.concatenate([b[:, :, :1], first @ entering[:, :-1]], axis=2)
     ago = np.arange(_AT_ONCE) - np.arange(_AT_ONCE)[:, None]
     own = np.where(ago >= 0, response[:, :, np.maximum(ago, 0)], 0.0)
-    return own, entering, leaving, power.T.copy()
+    entering, turn = _orthonormal(entering)
+    carried = power.T @ turn
+    for i in range(size):
+        carried[i] = (carried[i] - turn[i, :i] @ carried[:i]) / turn[i, i]
+    return (
+        own.astype(float),
+        entering.astype(float),
+        (leaving @ turn).astype(float),
+        carried.astype(float),
+    )
+
+
+def _orthonormal(rows: NDArray[np.longdouble]) -> tuple[Any, Any]:
+    """Return Q (n, L) with orthonormal rows and T (n, n), lower triangular, of rows T Q."""
+    q, turn = rows.copy(), np.zeros((len(rows),) * 2, np.longdouble)
+    for i in range(len(q)):
+        # what rounding leaves of the first subtraction goes with the second
+        for j in [*range(i), *range(i)]:
+            along = q[i] @ q[j]
+            turn[i, j] += along
+            q[i] -= along * q[j]
+        size = np.sqrt(q[i] @ q[i])
+        turn[i, i] = size if size > 0 else 1.0
+        q[i] /= turn[i, i]
+    return q, turn
 
 
 def _stepped(a: Array, b: Array, out: Array) -> None:

@@ -17,7 +17,7 @@ Kittler (1994), on letting terms leave again.
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,10 @@ _LEAVES = 0.5
 
 @dataclass(frozen=True)
 class _Point:
-    """Parameters with the cost and its quadratic model there, in those that are `known`."""
+    """Parameters with the cost and its quadratic model there, in those that are `known`.
+
+    `rows` are the derivatives (n, ny, known) that it was made of.
+    """
 
     p: Array
     cost: float
@@ -73,6 +76,7 @@ class _Point:
     hessian: Array
     gradient: Array
     bounds: tuple[Array, Array]
+    rows: Array
 
     def solution(self, hessian: Array, gradient: Array, active: Array) -> Array:
         """Return the step (q,) that minimises the quadratic model over the active parameters."""
@@ -256,24 +260,54 @@ class FreeRunSelection:
         with np.errstate(over="ignore"):
             return 0.5 * self._samples * float(np.log(self._noise(r)).sum())
 
+    def _rows(self, runs: _Runs, p: Array, only: Sequence[int]) -> Array:
+        """Return derivatives of the used samples' outputs in some parameters, (n, ny, only)."""
+        slopes = runs.by_parameters(p, self.starts, only)
+        rows = slopes.reshape(-1, slopes.shape[2], len(only))
+        return rows if self._used.all() else rows[self._used]
+
+    def _by_output(self, runs: _Runs, p: Array) -> tuple[Array, Array]:
+        """Return residuals of the used samples in noise deviations (ny, n), and weights (ny,).
+
+        A weight takes a derivative into the same deviations.
+        """
+        weighted, _, _ = runs.value(p, self.starts)
+        with np.errstate(over="ignore", invalid="ignore"):
+            root = np.sqrt(self._noise(weighted))
+            r = weighted.reshape(-1, weighted.shape[-1])[self._used] / root
+        return r.T, 1 / (root * runs.sigma)
+
     def _at(self, runs: _Runs, p: Array, cost: float, known: Sequence[int]) -> _Point:
         """Return the quadratic model in some of the parameters, which takes a share of the time."""
-        weighted, _, _ = runs.value(p, self.starts)
-        slopes = runs.by_parameters(p, self.starts, known)
-        ny, used = weighted.shape[-1], self._used
-        rows, r = slopes.reshape(-1, ny, len(known)), weighted.reshape(-1, ny)
-        if not used.all():
-            rows, r = rows[used], r[used]
+        rows = self._rows(runs, p, known)
         normal, right = np.zeros((len(known), len(known))), np.zeros(len(known))
         with np.errstate(over="ignore", invalid="ignore"):
-            for i, noise in enumerate(self._noise(weighted)):
-                # one output at a time: the rows of all are large
-                own = rows[:, i]
-                normal += (own.T @ own) / (noise * runs.sigma[i] ** 2)
-                right += (own.T @ r[:, i]) / (noise * runs.sigma[i])
+            # one output at a time: the rows of all are large
+            for own, r, weight in zip(rows.swapaxes(0, 1), *self._by_output(runs, p), strict=True):
+                normal += weight**2 * (own.T @ own)
+                right += weight * (own.T @ r)
         hessian, gradient = np.zeros((len(p), len(p))), np.zeros(len(p))
         hessian[np.ix_(known, known)], gradient[known] = normal, right
-        return _Point(p, cost, known, hessian, gradient, (self._least, self._most))
+        bounds = (self._least, self._most)
+        return _Point(p, cost, known, hessian, gradient, bounds, rows)
+
+    def _widened(self, runs: _Runs, at: _Point) -> _Point:
+        """Return the quadratic model in all parameters, but without those that are out together."""
+        known, out = np.array(at.known), np.setdiff1d(np.arange(len(at.p)), at.known)
+        rows = self._rows(runs, at.p, out.tolist())
+        cross, own, right = np.zeros((len(known), len(out))), np.zeros(len(out)), np.zeros(len(out))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for mine, new, r, weight in zip(
+                at.rows.swapaxes(0, 1), rows.swapaxes(0, 1), *self._by_output(runs, at.p),
+                strict=True,
+            ):  # fmt: skip
+                cross += weight**2 * (mine.T @ new)
+                own += weight**2 * np.einsum("ij,ij->j", new, new)
+                right += weight * (new.T @ r)
+        hessian, gradient = at.hessian.copy(), at.gradient.copy()
+        hessian[np.ix_(known, out)], hessian[np.ix_(out, known)] = cross, cross.T
+        hessian[out, out], gradient[out] = own, right
+        return replace(at, hessian=hessian, gradient=gradient)
 
     def _moved(self, runs: _Runs, at: _Point, step: Array, known: Sequence[int]) -> _Point | None:
         """Return where a step or a part of it leads downhill, None where it does not."""
@@ -326,8 +360,7 @@ class FreeRunSelection:
     ) -> tuple[int, _Point] | None:
         """Return the term that lowers the error most and the fit with it, None if none earns."""
         index = np.array(active)
-        if len(at.known) < len(at.p):
-            at = self._at(runs, at.p, at.cost, range(len(at.p)))
+        at = self._widened(runs, at)
         hessian, gradient = at.hessian, at.gradient
         inverse = scaled_inverse(hessian[np.ix_(index, index)], RANK)
         out = np.setdiff1d(np.arange(len(at.p)), index)
