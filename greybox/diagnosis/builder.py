@@ -285,7 +285,7 @@ class DiagnosisBuilder:
     def where(self, validate: Sequence[TrialLog]) -> str:
         """Say what is held out."""
         if validate:
-            return f"on {', '.join(log.name for log in validate)}, which were not used in the fit"
+            return f"on {', '.join(log.name for log in validate)}, held out from the fit"
         return (
             f"on {FOLDS} parts of the logs, each predicted by a fit to the others, because no "
             f"validation log was given"

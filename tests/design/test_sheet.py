@@ -278,7 +278,9 @@ def test_without_a_printer_the_sheet_is_a_page(short, tmp_path, monkeypatch):
 
 
 def test_other_endings_are_refused(known, tmp_path):
-    with pytest.raises(UsageError, match=r"the sheet 'plan\.docx' has no ending .* use \.pdf"):
+    with pytest.raises(
+        UsageError, match=r"the sheet 'plan\.docx' cannot be written with this ending: use \.pdf"
+    ):
         write_sheet(known, tmp_path / "plan.docx")
     assert not list(tmp_path.iterdir())
     assert sheet_kind("a.HTM") == ".html"

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from greybox.errors import UsageError
+from greybox.errors import LogError, UsageError
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.checks.actuators import measure_actuators
 from greybox.trial.checks.course import course_findings
@@ -170,14 +171,13 @@ def misnamed_columns(paths: Sequence[str | Path], vessel: Vessel) -> list[str]:
     Returns
     -------
     list of str
-        A sentence for each of these findings: the evidence, and what to write or run.
-
-    Raises
-    ------
-    LogError
-        As `check_files`.
+        A sentence for each of these findings: the evidence, and what to write or run. A log
+        that only a check refuses has none.
     """
-    logs = [_signal_quality(read_recording(path, vessel), vessel) for path in paths]
+    logs = []
+    for path in paths:
+        with suppress(LogError):
+            logs.append(_signal_quality(read_recording(path, vessel), vessel))
     _read_columns(logs)
     return [
         f"{log.recorded.name}: {f.evidence}. To mend it, {f.fix}."
