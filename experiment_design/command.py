@@ -140,6 +140,14 @@ for _type, _name in (
     _type.__name__ = _name
 
 
+def _declare(
+    group: argparse._ArgumentGroup, *rows: tuple[str, Callable[[str], Any], str, str]
+) -> None:
+    """Declare options of one value, None where it is not given: name, type, metavar and help."""
+    for name, kind, metavar, said in rows:
+        group.add_argument(name, type=kind, metavar=metavar, help=said)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
@@ -246,48 +254,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     motion = parser.add_argument_group("limits")
     motion.add_argument("--regime", metavar="u+v+", help="signs of the velocities to keep (auto)")
     for name, word in (("u", "surge"), ("v", "sway")):
-        motion.add_argument(
-            f"--margin-{name}",
-            type=_not_negative,
-            metavar="M",
-            help=f"keep {word} through the water at |{name}_r| of M or more [m/s]",
-        )
-    motion.add_argument(
-        "--margin-air",
-        type=_not_negative,
-        metavar="M",
-        help="keep the measured wind at |u_q| and |v_q| of M or more, of either sign [m/s]",
-    )
-    motion.add_argument(
-        "--hold",
-        type=positive,
-        metavar="S",
-        help="commands change every S s (10; for prediction when the ship has sailed three "
-        "quarters of her length)",
-    )
-    motion.add_argument(
-        "--start",
-        type=_floats,
-        metavar="u,v,r,psi",
-        help="state at the start [m/s, m/s, rad/s, rad] (chosen; with --after the end of the last "
-        "log)",
-    )
+        said = f"keep {word} through the water at |{name}_r| of M or more [m/s]"
+        _declare(motion, (f"--margin-{name}", _not_negative, "M", said))
+    _declare(
+        motion,
+        ("--margin-air", _not_negative, "M",
+         "keep the measured wind at |u_q| and |v_q| of M or more, of either sign [m/s]"),
+        ("--hold", positive, "S", "commands change every S s (10; for prediction when the ship has "
+         "sailed three quarters of her length)"),
+        ("--start", _floats, "u,v,r,psi", "state at the start [m/s, m/s, rad/s, rad] (chosen; with "
+         "--after the end of the last log)"),
+    )  # fmt: skip
     motion.add_argument(
         "--trials", type=_whole, default=1, metavar="K", help="number of trials (1)"
     )
     motion.add_argument("--area", metavar="CSV", help="sea room: the corners x_n, y_n [m]")
-    motion.add_argument(
-        "--circle",
-        type=_floats,
-        metavar="N,E,R",
-        help="round sea room: north and east of its centre, radius [m]",
-    )
-    motion.add_argument(
-        "--position",
-        type=_pair,
-        metavar="N,E",
-        help="north and east of the start [m] (0,0; with --after the end of the last log)",
-    )
+    _declare(
+        motion,
+        ("--circle", _floats, "N,E,R",
+         "round sea room: north and east of its centre, radius [m]"),
+        ("--position", _pair, "N,E",
+         "north and east of the start [m] (0,0; with --after the end of the last log)"),
+    )  # fmt: skip
     motion.add_argument(
         "--clearance",
         type=_not_negative,
@@ -295,10 +283,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="distance to keep from the edge of the sea room [m] (0)",
     )
-    motion.add_argument(
-        "--speed-cap", type=positive, metavar="M", help="highest speed over ground [m/s]"
+    _declare(
+        motion,
+        ("--speed-cap", positive, "M", "highest speed over ground [m/s]"),
+        ("--yaw-cap", positive, "R", "highest yaw rate [rad/s]"),
     )
-    motion.add_argument("--yaw-cap", type=positive, metavar="R", help="highest yaw rate [rad/s]")
     motion.add_argument(
         "--end",
         nargs="+",
@@ -306,31 +295,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE:TOL",
         help="final u, v, r, psi, x_n or y_n, with its tolerance (0.05)",
     )
-    motion.add_argument(
-        "--energy", type=positive, metavar="E", help="highest mean of (n/n_max)^3, such as 0.5"
-    )
-    motion.add_argument(
-        "--headings", type=positive, metavar="RAD", help="range of headings to cover [rad]"
+    _declare(
+        motion,
+        ("--energy", positive, "E", "highest mean of (n/n_max)^3, such as 0.5"),
+        ("--headings", positive, "RAD", "range of headings to cover [rad]"),
     )
     belief = parser.add_argument_group("prior knowledge")
-    belief.add_argument(
-        "--current", type=_pair, metavar="N,E", help="expected current, north and east [m/s]"
-    )
-    belief.add_argument(
-        "--wind", type=_pair, metavar="N,E", help="expected wind, north and east [m/s]"
-    )
-    belief.add_argument(
-        "--gust",
-        type=_not_negative,
-        metavar="M",
-        help="standard deviation of the wind about its mean [m/s] (15 %% of the mean)",
-    )
-    belief.add_argument(
-        "--process-noise",
-        type=_floats,
-        metavar="U,V,R",
-        help="standard deviation of the process noise, per sample",
-    )
+    _declare(
+        belief,
+        ("--current", _pair, "N,E", "expected current, north and east [m/s]"),
+        ("--wind", _pair, "N,E", "expected wind, north and east [m/s]"),
+        ("--gust", _not_negative, "M",
+         "standard deviation of the wind about its mean [m/s] (15 %% of the mean)"),
+        ("--process-noise", _floats, "U,V,R",
+         "standard deviation of the process noise, per sample"),
+    )  # fmt: skip
     belief.add_argument(
         "--robust",
         type=count,
