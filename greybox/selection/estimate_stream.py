@@ -14,12 +14,12 @@ from greybox.estimation.problem import EstimationOptions, EstimationProblem, Fit
 from greybox.estimation.refined import add_noise
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
-from greybox.estimation.streamed import Streamed, StreamProblem, estimate_sums
+from greybox.estimation.streamed import Streamed, estimate_sums
 from greybox.model.predictor import Predictor
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.numerics.effort import within
 from greybox.public import one_thread
-from greybox.regression.problem import RegressionProblem
+from greybox.regression.problem import RegressionProblem, RegressionSettings
 from greybox.selection.estimate import estimate_requested, weighed, with_runs
 from greybox.selection.prediction import part_of_estimate, refit_alike, with_prediction
 from greybox.selection.request import Request
@@ -141,9 +141,9 @@ def estimate_stream(
     problem = EstimationProblem(tuple(logs), first.predictor.structure, kind, **asked)
     instruments = ESTIMATORS[request.method or ""].instruments
     closed, loop_test = problem.loop_test(request.method or "")
-    settings = StreamProblem(
+    settings = RegressionSettings(
         first.predictor,
-        request.margins,
+        margins=request.margins,
         zero_mean=request.zero_mean and instruments,
         heading=request.heading,
         wind=problem.instrument_wind,
@@ -157,10 +157,7 @@ def estimate_stream(
 
     streamed, dropped = problem.drop_unexcited(first.predictor, fit)
     estimate = streamed.estimate
-    regression = RegressionProblem(
-        estimate.predictor, tuple(logs), request.margins, settings.zero_mean, settings.heading,
-        settings.wind, settings.lag,
-    )  # fmt: skip
+    regression = replace(settings, predictor=estimate.predictor).on(logs)
     # how the estimate on the stretches ended says nothing of this one
     ended = ESTIMATORS[first.method].ended.format(status=first.status)
     notes += [*(n for n in first.notes if n != ended), *dropped, drawn.sentence]
