@@ -257,7 +257,7 @@ def _few(
         np.concatenate([part[run] for part in series], axis=1, out=kernel.read)
         kernel.start[:] = out[run, 0]
         kernel.constants[0][:] = theta[run]
-        out[run, 1:] = kernel()
+        kernel(out[run, 1:])
 
 
 def _many(
