@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from greybox.commands.common import (
     add_cluster,
     add_logs,
+    add_memory,
     add_seed,
     positive,
     provenance,
@@ -18,6 +19,7 @@ from greybox.public import one_thread
 
 if TYPE_CHECKING:
     from greybox.diagnosis.result import Diagnosis
+    from greybox.selection.stretches import Drawn
     from greybox.trial.log import TrialLog
 
 HELP = "show what the simulation gets wrong, name the cause, extend the model"
@@ -73,6 +75,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="decimate the logs to this sample time; by default that of MODEL, or what suits the "
         "ship's pace",
     )
+    add_memory(
+        parser,
+        "of logs that would take more memory than this [GiB] the stretches that tell most are "
+        "diagnosed",
+    )
     add_seed(parser)
     add_cluster(parser)
 
@@ -84,8 +91,13 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
     from greybox.files import check_targets, write_json
-    from greybox.model.catalogue import get_structure
+    from greybox.model.catalogue import get_structure, structure_for
     from greybox.model.model import load_model
+    from greybox.selection.estimate_stream import BYTES
+    from greybox.selection.stretches import draw
+    from greybox.trial.log_files import find_logs
+    from greybox.trial.stream import estimated_rows, open_stream
+    from greybox.vessel.force import force_inputs
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.out, options.json, options.report)
@@ -93,8 +105,24 @@ def run(options: argparse.Namespace) -> None:
     model = load_model(options.model).coefficient_model() if options.model else None
     structure = get_structure(options.structure) if model is None else model.structure
     sample_time = options.sample_time or (model.sample_time if model else None)
-    logs, left_out = read_logs(options.logs, vessel, sample_time, structure.states)
     validate, also = read_logs(options.validate, vessel, sample_time, structure.states)
+    files = find_logs(options.logs)
+    told: dict[str, Any] = {}
+    if estimated_rows(files) * BYTES <= options.memory * 2**30:
+        logs, left_out = read_logs(options.logs, vessel, sample_time, structure.states)
+    else:
+        stream = open_stream(files, vessel, states=structure.states, sample_time=sample_time)
+        if model is None:
+            structure = structure_for(options.structure, force_inputs(vessel))
+        drawn = draw(stream, structure)
+        drawn.require_others(validate)
+        logs, left_out = list(drawn.logs), (*drawn.stream.left_out, _drawn_from(drawn))
+        told["stream"] = {
+            "files": len(drawn.stream.parts),
+            "rows": drawn.stream.rows,
+            "left_out": list(drawn.stream.left_out),
+            "drawn": drawn.to_dict(["diagnosis"]),
+        }
     diagnosis = diagnose(
         logs,
         model=model,
@@ -112,7 +140,7 @@ def run(options: argparse.Namespace) -> None:
     if options.out:
         _save(diagnosis, options.out, record)
     if options.json:
-        write_json(diagnosis.to_dict() | {"provenance": record}, options.json)
+        write_json(diagnosis.to_dict() | told | {"provenance": record}, options.json)
     if options.report:
         from greybox.report.diagnosis import diagnosis_page
         from greybox.report.page import write_page
@@ -123,6 +151,13 @@ def run(options: argparse.Namespace) -> None:
         for path in (options.out, options.report):
             if path:
                 say(f"wrote {path}")
+
+
+def _drawn_from(drawn: Drawn) -> str:
+    return (
+        f"the logs hold {drawn.data.samples} samples, more than --memory lets in, and the "
+        f"diagnosis rests on {drawn.part}."
+    )
 
 
 def _read(logs: list[TrialLog]) -> list[str]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from greybox.commands.common import (
     add_cluster,
     add_logs,
+    add_memory,
     add_seed,
     positive,
     progress,
@@ -20,9 +21,6 @@ from greybox.estimation.registry import ESTIMATORS
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.numerics.effort import EFFORT
 from greybox.public import one_thread
-
-# GiB that an estimate may hold by default: those of a usual machine, and of 260,000 samples
-MEMORY = 4.0
 
 if TYPE_CHECKING:
     from greybox.selection.estimate_stream import StreamEstimate
@@ -120,13 +118,10 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="decimate the logs to this sample time [s]; by default that of the logs",
     )
-    group.add_argument(
-        "--memory",
-        type=positive,
-        default=MEMORY,
-        metavar="GIB",
-        help="logs whose estimate would take more memory than this [GiB] are read in passes, and "
-        f"tests rest on the stretches that tell most ({MEMORY:g})",
+    add_memory(
+        group,
+        "logs whose estimate would take more memory than this [GiB] are read in passes, and tests "
+        "rest on the stretches that tell most",
     )
     group.add_argument(
         "--validate",

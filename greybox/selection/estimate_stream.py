@@ -21,7 +21,7 @@ from greybox.numerics.effort import within
 from greybox.public import one_thread
 from greybox.regression.problem import RegressionProblem, RegressionSettings
 from greybox.selection.estimate import estimate_requested, weighed, with_runs
-from greybox.selection.prediction import part_of_estimate, refit_alike, with_prediction
+from greybox.selection.prediction import refit_alike, with_prediction
 from greybox.selection.request import Request
 from greybox.selection.stretches import Drawn
 
@@ -60,15 +60,7 @@ class StreamEstimate:
             "passes": self.streamed.passes,
             "segments_without_bounded_simulation": list(self.streamed.sums.lost),
             "left_out": list(stream.left_out),
-            "drawn": {
-                "rests_on_it": ["predictor", "noise", "tests", "prediction", "fit"],
-                "samples": self.drawn.samples,
-                "share": self.drawn.share,
-                "stretches": [
-                    {"name": log.name, "start": float(log.t[0]), "samples": len(log)}
-                    for log in self.drawn.logs
-                ],
-            },
+            "drawn": self.drawn.to_dict(["predictor", "noise", "tests", "prediction", "fit"]),
         }
 
 
@@ -125,7 +117,7 @@ def estimate_stream(
     """
     require_adding(request)
     logs = list(drawn.logs)
-    _require_others(drawn, request)
+    drawn.require_others(request.validate)
     notes: list[str] = []
     if request.method is None:
         notes.append(
@@ -174,14 +166,6 @@ def estimate_stream(
             estimate = with_prediction(estimate, logs, request, refit_alike(estimate, request))
     told = (*streamed.sums.stream.left_out, *estimate.notes)
     return StreamEstimate(replace(estimate, notes=told), drawn, streamed)
-
-
-def _require_others(drawn: Drawn, request: Request) -> None:
-    """Refuse a log that validates and is a file of the stream, drawn from or not."""
-    files = {f.known.sha256 for f in drawn.stream.parts}
-    for log in request.validate:
-        if log.provenance.sha256 in files:
-            raise part_of_estimate(log)
 
 
 def _judged(estimate: Estimate, streamed: Streamed, regression: RegressionProblem) -> Estimate:
