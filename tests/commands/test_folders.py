@@ -107,8 +107,30 @@ def test_logs_beyond_the_memory_are_diagnosed_on_stretches(folder, tmp_path, mon
     assert found["stream"]["drawn"]["share"] == pytest.approx(2 / 3)
     assert any("rests on 800 of them (66.7 %) in 2 stretches" in n for n in found["notes"])
     assert len(found["provenance"]["logs"]) == 2
-    with pytest.raises(SystemExit):
-        main([*asked, "--validate", str(folder / "day2.csv")])
+    assert main([*asked, "--validate", str(folder / "day2.csv")]) == 1
+
+
+def test_logs_beyond_the_memory_are_checked_in_groups(folder, tmp_path, capsys):
+    found = []
+    for name, memory in (("whole", 4), ("groups", 0.0035)):
+        out, page = tmp_path / f"{name}.json", tmp_path / f"{name}.html"
+        main(["check", str(folder), "--vessel", "thesis", "--memory", str(memory),
+              "--json", str(out), "--report", str(page)])  # fmt: skip
+        found.append(json.loads(out.read_text()))
+        assert page.exists()
+    whole, groups = found
+    assert groups["provenance"]["judged_together"] == [["day0.csv", "day1.csv"], ["day2.csv"]]
+    assert (
+        "3 logs take more than --memory, and were judged together in 2" in capsys.readouterr().out
+    )
+    # what each log is judged by alone is the same
+    for a, b in zip(whole["logs"], groups["logs"], strict=True):
+        assert (a["log"], a["regimes"], a["manoeuvres"]) == (
+            b["log"],
+            b["regimes"],
+            b["manoeuvres"],
+        )
+    assert "judged_together" not in whole["provenance"]
 
 
 def test_a_broken_file_of_a_stream_is_left_out_and_named(folder, tmp_path):
