@@ -3,8 +3,18 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
-from greybox.commands.common import provenance, say
+from greybox.commands.common import add_memory, provenance, say
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from greybox.trial.checks.finding import CheckReport
+    from greybox.trial.log_files import LogFile
+
+# what the checks hold in memory for each row of a log: 0.4 kB were measured of three files
+_BYTES = 512
 
 HELP = "find what is wrong with logs by kinematics: gaps, frames, signs, units, clocks, lever arm"
 EXAMPLES = """examples:
@@ -24,15 +34,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
     parser.add_argument("--json", metavar="F", help="write the findings as JSON; - is stdout")
     parser.add_argument("--report", metavar="HTML", help="write a page with a picture per finding")
+    add_memory(
+        parser,
+        "logs that would take more memory than this [GiB] are judged together in groups, in their "
+        "order, and nothing is drawn of them",
+    )
+
+
+def _groups(files: Sequence[LogFile], memory: float) -> list[list[LogFile]]:
+    """Return files in groups that a memory [GiB] holds, at least one file each."""
+    from greybox.trial.stream import estimated_rows
+
+    groups: list[list[LogFile]] = []
+    held = 0.0
+    for file in files:
+        size = estimated_rows([file]) * _BYTES / 2**30
+        if not groups or held + size > memory:
+            groups.append([])
+            held = 0.0
+        groups[-1].append(file)
+        held += size
+    return groups
 
 
 def run(options: argparse.Namespace) -> None:
     """Run the command: read the logs, check them, show the findings."""
+    from dataclasses import replace
     from pathlib import Path
     from textwrap import indent
 
     from greybox.files import check_targets, write_json
-    from greybox.trial.checks.check import check_files
+    from greybox.trial.checks.check import check_files, require_each_once
     from greybox.trial.checks.finding import shared_findings
     from greybox.trial.log_files import find_logs
     from greybox.trial.repair import apply_repairs
@@ -41,23 +73,34 @@ def run(options: argparse.Namespace) -> None:
 
     check_targets(options.json, options.report)
     vessel = load_vessel(options.vessel)
-    paths = [Path(file.path) for file in find_logs(options.logs)]
-    reports = check_files(paths, vessel)
-    contents = [
-        describe_recording(apply_repairs(r.recording, [f for f in r.findings if f.safe]), vessel)
-        if r.recording is not None
-        else Contents()
-        for r in reports
-    ]
+    files = find_logs(options.logs)
+    paths = [Path(file.path) for file in files]
+    require_each_once(paths)
+    groups = _groups(files, options.memory)
+    reports: list[CheckReport] = []
+    contents: list[Contents] = []
+    for group in groups:
+        found = check_files([file.path for file in group], vessel)
+        contents += [
+            describe_recording(
+                apply_repairs(r.recording, [f for f in r.findings if f.safe]), vessel
+            )
+            if r.recording is not None
+            else Contents()
+            for r in found
+        ]
+        reports += [replace(r, recording=None) for r in found] if len(groups) > 1 else found
     record = provenance(options)
+    if len(groups) > 1:
+        record["judged_together"] = [[file.name for file in group] for group in groups]
     if options.json:
-        found = [r.to_dict() | s.to_dict() for r, s in zip(reports, contents, strict=True)]
-        if len(found) == 1:
-            result = found[0]
+        told = [r.to_dict() | s.to_dict() for r, s in zip(reports, contents, strict=True)]
+        if len(told) == 1:
+            result = told[0]
         else:
             result = {
-                "findings": [{**f, "log": r["log"]} for r in found for f in r["findings"]],
-                "logs": found,
+                "findings": [{**f, "log": r["log"]} for r in told for f in r["findings"]],
+                "logs": told,
             }
         write_json({**result, "provenance": record}, options.json)
     if options.report:
@@ -73,5 +116,10 @@ def run(options: argparse.Namespace) -> None:
             say(report.summary_beside(shared))
             if holds.summary():
                 say(indent(holds.summary(), "  "))
+        if len(groups) > 1:
+            say(
+                f"\nnote: {len(reports)} logs take more than --memory, and were judged together in "
+                f"{len(groups)} groups of up to {max(map(len, groups))}, in their order."
+            )
         if options.report:
             say(f"\nwrote {options.report}")

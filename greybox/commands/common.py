@@ -20,10 +20,12 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "add_cluster", "add_logs", "add_outputs", "add_seed", "complain", "count", "positive",
-    "progress", "provenance", "publish", "read_logs", "say",
+    "add_cluster", "add_logs", "add_memory", "add_outputs", "add_seed", "complain", "count",
+    "positive", "progress", "provenance", "publish", "read_logs", "say",
 ]  # fmt: skip
 
+# GiB that logs and what is made of them may take by default, those of a usual machine
+_MEMORY = 4.0
 # where a command computes changes no result
 SHELL_ONLY = (
     "run", "typed", "verbose", "more_verbose", "quiet", "no_config", "configuration", "cluster",
@@ -104,6 +106,13 @@ def add_seed(parser: argparse.ArgumentParser) -> None:
     """Add --seed."""
     parser.add_argument(
         "--seed", type=count, default=0, metavar="N", help="seed of the random numbers (0)"
+    )
+
+
+def add_memory(parser: argparse._ActionsContainer, text: str) -> None:
+    """Add --memory, whose help begins with `text`."""
+    parser.add_argument(
+        "--memory", type=positive, default=_MEMORY, metavar="GIB", help=f"{text} ({_MEMORY:g})"
     )
 
 

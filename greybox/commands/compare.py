@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from greybox.commands.common import add_outputs, add_seed, provenance, publish
+from greybox.commands.common import add_memory, add_outputs, add_seed, provenance, publish
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from greybox.report.page import Page
+    from greybox.trial.log import TrialLog
 
 HELP = "compare free runs of models with logs: fit, errors, bands, plots"
 EXAMPLES = """examples:
@@ -39,6 +42,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="leave out the bands in which 95 %% of the measurements should lie",
     )
+    add_memory(
+        parser,
+        "logs that would take more memory than this [GiB] are read one file at a time, and only "
+        "what the tables tell is kept of each, with --report the samples of those drawn",
+    )
     add_seed(parser)
 
 
@@ -52,7 +60,8 @@ def run(options: argparse.Namespace) -> None:
     from greybox.trial.checks.check import misnamed_columns
     from greybox.trial.convert.read import read_log
     from greybox.trial.log_files import find_logs
-    from greybox.validation.comparison import compare
+    from greybox.trial.stream import estimated_rows
+    from greybox.validation.comparison import BYTES, compare_each
 
     check_targets(options.json, options.report)
     models = [load_model(path) for path in options.models]
@@ -63,21 +72,29 @@ def run(options: argparse.Namespace) -> None:
     names = [n if n not in names[:i] else f"{n} ({i + 1})" for i, n in enumerate(names)]
     named = dict(zip(names, models, strict=True))
     files = find_logs(options.log)
-    logs = {
-        name: [
+    columns: Iterable[list[TrialLog]] = (
+        [
             read_log(file.path, model.vessel, states=model.structure.states, gaps=True)
-            for file in files
+            for model in models
         ]
-        for name, model in named.items()
-    }
-    comparison = compare(
-        named, logs, heading=options.heading, bands=not options.no_bands, seed=options.seed
+        for file in files
     )
+    whole = None
+    if estimated_rows(files) * len(models) * BYTES > options.memory * 2**30:
+        from greybox.report.comparison import MOST_LOGS
+
+        whole = MOST_LOGS if options.report else 0
+    else:
+        # a log that cannot be read is told before the others are compared
+        columns = list(columns)
+    comparison = compare_each(
+        named, columns, heading=options.heading, bands=not options.no_bands, seed=options.seed,
+        whole=whole,
+    )  # fmt: skip
     misnamed = (n for m in models for n in misnamed_columns([f.path for f in files], m.vessel))
     comparison = replace(comparison, notes=tuple(dict.fromkeys(misnamed)))
-    record = provenance(options) | {
-        "logs": [log.provenance.source + " " + log.provenance.sha256[:12] for log in logs[names[0]]]
-    }
+    of = [run.log.provenance for run in comparison.runs[0]]
+    record = provenance(options) | {"logs": [f"{p.source} {p.sha256[:12]}" for p in of]}
 
     def page() -> Page:
         from greybox.report.comparison import comparison_page

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from greybox.commands.common import (
     add_cluster,
     add_logs,
+    add_memory,
     add_outputs,
     add_seed,
     positive,
@@ -20,6 +21,7 @@ from greybox.public import one_thread
 if TYPE_CHECKING:
     from greybox.diagnosis.result import Diagnosis
     from greybox.report.page import Page
+    from greybox.selection.stretches import Drawn
     from greybox.trial.log import TrialLog
 
 HELP = "show what the simulation gets wrong, name the cause, extend the model"
@@ -78,6 +80,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="decimate the logs to this sample time; by default that of MODEL, or one that suits "
         "the ship's speed",
     )
+    add_memory(
+        parser,
+        "memory limit [GiB]; of larger logs the most informative stretches are diagnosed",
+    )
     add_seed(parser)
     add_cluster(parser)
 
@@ -89,8 +95,13 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
     from greybox.files import check_targets
-    from greybox.model.catalogue import get_structure
+    from greybox.model.catalogue import get_structure, structure_for
     from greybox.model.model import load_model
+    from greybox.selection.estimate_stream import BYTES
+    from greybox.selection.stretches import draw
+    from greybox.trial.log_files import find_logs
+    from greybox.trial.stream import estimated_rows, open_stream
+    from greybox.vessel.force import force_inputs
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.out, options.json, options.report)
@@ -98,8 +109,24 @@ def run(options: argparse.Namespace) -> None:
     model = load_model(options.model).coefficient_model() if options.model else None
     structure = get_structure(options.structure) if model is None else model.structure
     sample_time = options.sample_time or (model.sample_time if model else None)
-    logs, left_out = read_logs(options.logs, vessel, sample_time, structure.states)
     validate, also = read_logs(options.validate, vessel, sample_time, structure.states)
+    files = find_logs(options.logs)
+    told: dict[str, Any] = {}
+    if estimated_rows(files) * BYTES <= options.memory * 2**30:
+        logs, left_out = read_logs(options.logs, vessel, sample_time, structure.states)
+    else:
+        stream = open_stream(files, vessel, states=structure.states, sample_time=sample_time)
+        if model is None:
+            structure = structure_for(options.structure, force_inputs(vessel))
+        drawn = draw(stream, structure)
+        drawn.require_others(validate)
+        logs, left_out = list(drawn.logs), (*drawn.stream.left_out, _drawn_from(drawn))
+        told["stream"] = {
+            "files": len(drawn.stream.parts),
+            "rows": drawn.stream.rows,
+            "left_out": list(drawn.stream.left_out),
+            "drawn": drawn.to_dict(["diagnosis"]),
+        }
     diagnosis = diagnose(
         logs,
         model=model,
@@ -122,8 +149,15 @@ def run(options: argparse.Namespace) -> None:
 
         return diagnosis_page(diagnosis, record)
 
-    told = diagnosis.to_dict() | {"provenance": record}
+    told = diagnosis.to_dict() | told | {"provenance": record}
     publish(options, told, diagnosis.summary(), page, [options.out])
+
+
+def _drawn_from(drawn: Drawn) -> str:
+    return (
+        f"the logs hold {drawn.data.samples} samples, more than --memory lets in, and the "
+        f"diagnosis rests on {drawn.part}."
+    )
 
 
 def _read(logs: list[TrialLog]) -> list[str]:

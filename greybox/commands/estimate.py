@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from greybox.commands.common import (
     add_cluster,
     add_logs,
+    add_memory,
     add_outputs,
     add_seed,
     positive,
@@ -21,9 +22,6 @@ from greybox.estimation.registry import ESTIMATORS
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.numerics.effort import EFFORT
 from greybox.public import one_thread
-
-# GiB that an estimate may hold by default: those of a usual machine, and of 260,000 samples
-MEMORY = 4.0
 
 if TYPE_CHECKING:
     from greybox.report.page import Page
@@ -121,13 +119,10 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="decimate the logs to this sample time [s]; by default that of the logs",
     )
-    group.add_argument(
-        "--memory",
-        type=positive,
-        default=MEMORY,
-        metavar="GIB",
-        help="memory limit [GiB]; larger logs are read in passes, and the tests use their most "
-        f"informative stretches ({MEMORY:g})",
+    add_memory(
+        group,
+        "memory limit [GiB]; larger logs are read in passes, and the tests use their most "
+        "informative stretches",
     )
     group.add_argument(
         "--validate",

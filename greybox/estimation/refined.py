@@ -244,7 +244,7 @@ def estimate_refined_iv(
     Söderström and Stoica (1983); Young (2008).
     """
     problem = RegressionProblem(
-        predictor, tuple(as_segments(logs)), margins, heading=heading, wind=wind
+        predictor, tuple(as_segments(logs)), margins=margins, heading=heading, wind=wind
     )
     own = isinstance(start, Estimate) and ESTIMATORS[start.method].instruments
     plain = start if isinstance(start, Estimate) and own else None
@@ -506,7 +506,7 @@ def with_noise(
     that the estimate predicts diverges.
     """
     problem = RegressionProblem(
-        estimate.predictor, tuple(logs), margins, heading=heading, wind=wind
+        estimate.predictor, tuple(logs), margins=margins, heading=heading, wind=wind
     )
     return add_noise(problem, estimate)
 

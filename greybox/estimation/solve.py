@@ -24,12 +24,13 @@ from greybox.estimation.informative import unexcited
 from greybox.estimation.normal_equations import Solution, solve_stacked
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
-from greybox.estimation.values import Iteration, estimation_data
+from greybox.estimation.values import EstimationData, Iteration, estimation_data
 from greybox.model.predictor import Predictor
 from greybox.numerics.linalg import scaled_inverse
 from greybox.regression.instruments import Instruments
-from greybox.regression.problem import RegressionProblem
+from greybox.regression.problem import RegressionProblem, RegressionSettings
 from greybox.regression.regression import Regression
+from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 # scaled singular value below which a direction counts as not excited
@@ -252,32 +253,77 @@ class Solved:
                 else ()
             )
             matrix, lags = _covariance(self, projected, residuals, covariance, seed, shapes)
-        return Estimate(
-            predictor=predictor,
-            method=self.method,
-            theta=theta,
-            covariance=matrix,
-            residual_std=np.array(
-                [np.sqrt(sum(float(e @ e) for e in each) / max(kept, 1)) for each in residuals]
-            ),
-            vessel=logs[0].vessel,
-            sample_time=problem.regression.sample_time,
-            data=estimation_data(
-                logs, predictor.structure.states, problem.regression.samples, kept
-            ),
+        return form_estimate(
+            problem,
+            self.method,
+            self.solutions,
+            matrix,
+            [sum(float(e @ e) for e in each) for each in residuals],
+            estimation_data(logs, predictor.structure.states, problem.regression.samples, kept),
+            logs[0].vessel,
+            problem.regression.sample_time,
             covariance_kind=covariance or "",
             lags=lags,
             iteration=self.iteration,
-            current=estimate_current(
-                predictor,
-                theta,
-                matrix,
-                heading_std=logs[0].vessel.std("psi") or 0.0,
-                heading_measured=problem.heading == "measured",
-            )
-            if covariance is not None
-            else (),
         )
+
+
+def form_estimate(
+    settings: RegressionSettings,
+    method: str,
+    solutions: Sequence[Solution],
+    covariance: Array,
+    squares: Sequence[float] | Array,
+    data: EstimationData,
+    vessel: Vessel,
+    sample_time: float,
+    *,
+    covariance_kind: str,
+    lags: int = 0,
+    iteration: Iteration = _NO_ITERATION,
+) -> Estimate:
+    """Return the estimate of equations that are solved.
+
+    Parameters
+    ----------
+    settings : RegressionSettings
+    method : str
+    solutions : sequence of Solution
+        One an equation.
+    covariance : ndarray
+        (p, p), of any content where `covariance_kind` is empty.
+    squares : sequence of float
+        (nx,) sum of the squared residuals of each equation.
+    data : EstimationData
+    vessel : Vessel
+    sample_time : float
+        [s]
+    covariance_kind, lags, iteration
+        As `Estimate`.
+    """
+    theta = _coefficients(solutions)
+    return Estimate(
+        predictor=settings.predictor,
+        method=method,
+        theta=theta,
+        covariance=covariance,
+        residual_std=np.sqrt(np.asarray(squares) / max(data.kept, 1)),
+        vessel=vessel,
+        sample_time=sample_time,
+        data=data,
+        covariance_kind=covariance_kind,
+        lags=lags,
+        iteration=iteration,
+        current=estimate_current(
+            settings.predictor,
+            theta,
+            covariance,
+            heading_std=vessel.std("psi") or 0.0,
+            heading_measured=settings.heading == "measured",
+        )
+        if covariance_kind
+        else (),
+    )
 
 
 def _regressors_as_instruments(regression: Regression) -> Instruments:
@@ -321,9 +367,9 @@ def _solve(
 
     def solved(row: int, mine: list[int]) -> Solution:
         logs = list(zip(regression.experiments, keep, strict=True))
-        phi = [_part(e.phi, mine, k) for e, k in logs]
+        phi = [samples_kept(e.phi[mine], k) for e, k in logs]
         y = [e.y[row, k] for e, k in logs]
-        z = [_part(z, mine, k) for z, k in zip(instruments.z, keep, strict=True)]
+        z = [samples_kept(z[mine], k) for z, k in zip(instruments.z, keep, strict=True)]
         return solve_stacked(z, phi, y, metric=metric)
 
     return solve_equations(
@@ -376,15 +422,14 @@ def solve_equations(
     return solutions
 
 
-def _part(rows: Array, mine: list[int], keep: NDArray[np.bool_]) -> Array:
-    """Return some rows at the samples that take part."""
-    own = rows[mine]
-    return own if keep.all() else own[:, keep]
+def samples_kept(rows: Array, keep: NDArray[np.bool_]) -> Array:
+    """Return the samples of rows (..., N) that take part."""
+    return rows if keep.all() else rows[..., keep]
 
 
 def largest_of(rows: Array, keep: NDArray[np.bool_]) -> Array:
     """Return the largest size of each of the rows (p, N) at the samples that take part, (p,)."""
-    return np.asarray(np.abs(rows if keep.all() else rows[:, keep]).max(axis=1, initial=0.0))
+    return np.asarray(np.abs(samples_kept(rows, keep)).max(axis=1, initial=0.0))
 
 
 def _require_excited(predictor: Predictor, largest: tuple[Array, Array]) -> None:

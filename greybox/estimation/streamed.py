@@ -8,24 +8,28 @@ errors follow from the sums alone.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError
 from greybox.estimation.covariance import allow_for_segments
-from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.normal_equations import Solution, Sums
 from greybox.estimation.result import Estimate
-from greybox.estimation.solve import iterate_instruments, largest_of, solve_equations
+from greybox.estimation.solve import (
+    form_estimate,
+    iterate_instruments,
+    largest_of,
+    samples_kept,
+    solve_equations,
+)
 from greybox.estimation.values import EstimationData, Iteration
 from greybox.model.predictor import Predictor
 from greybox.numerics.linalg import scaled_inverse
-from greybox.regression.instruments import build_instruments
+from greybox.regression.problem import RegressionSettings
 from greybox.regression.regression import build_experiment
 from greybox.trial.log import TrialLog
 from greybox.trial.stream import LogStream
@@ -39,18 +43,6 @@ _SETTLED = 1e-2
 _MAY_DIVERGE = 0.1
 # groups of segments whose sums are kept apart, for the spread between them
 _GROUPS = 1000
-
-
-@dataclass(frozen=True)
-class StreamProblem:
-    """What an estimate from a stream rests on; fields as those of `RegressionProblem`."""
-
-    predictor: Predictor
-    margins: Mapping[str, float] | None = None
-    zero_mean: bool = True
-    heading: Literal["measured", "simulated"] = "measured"
-    wind: Literal["smoothed", "measured"] = "smoothed"
-    lag: int = 0
 
 
 @dataclass(frozen=True)
@@ -76,13 +68,13 @@ class LogSums:
 
 
 def sum_log(
-    problem: StreamProblem, theta: Array | None, cut: Array | str | None, log: TrialLog
+    settings: RegressionSettings, theta: Array | None, cut: Array | str | None, log: TrialLog
 ) -> LogSums:
     """Return the sums of one segment.
 
     Parameters
     ----------
-    problem : StreamProblem
+    settings : RegressionSettings
     theta : ndarray, optional
         (p,) parameters of the structure that simulate the instruments; without them the
         regressors are the instruments.
@@ -91,36 +83,27 @@ def sum_log(
         by default `theta`.
     log : TrialLog
     """
-    predictor = problem.predictor
-    own = build_experiment(predictor, log, margins=problem.margins)
+    predictor = settings.predictor
+    own = build_experiment(predictor, log, margins=settings.margins)
     keep: NDArray[np.bool_] = own.keep
     z: Array | None = None
     samples, none = len(keep), np.zeros((2, len(own.phi)))
     if theta is not None:
-        simulate = partial(
-            build_instruments, predictor, [log], heading=problem.heading, wind=problem.wind,
-            zero_mean=problem.zero_mean, lag=problem.lag, margins=problem.margins,
-        )  # fmt: skip
         rows = [own.keep] if isinstance(cut, str) else None
-        if isinstance(cut, np.ndarray) and problem.margins:
-            rows = list(simulate(cut).keep)
-        made = simulate(theta, keep=rows or None)
+        if isinstance(cut, np.ndarray) and settings.margins:
+            rows = list(settings.simulated([log], cut).keep)
+        made = settings.simulated([log], theta, rows or None)
         if made.diverged:
             return LogSums(samples, 0, (), none, made.diverged)
         keep, z = made.keep[0], made.z[0]
     equations = []
     for row, state in enumerate(predictor.structure.states):
         mine = predictor.equation(state)
-        phi, y = _part(own.phi[mine], keep), _part(own.y[row], keep)
-        equations.append(Sums.of(None if z is None else _part(z[mine], keep), phi, y))
+        phi, y = samples_kept(own.phi[mine], keep), samples_kept(own.y[row], keep)
+        equations.append(Sums.of(None if z is None else samples_kept(z[mine], keep), phi, y))
     size = largest_of(own.phi, keep)
     largest = np.stack([size, size if z is None else largest_of(z, keep)])
     return LogSums(samples, int(keep.sum()), tuple(equations), largest)
-
-
-def _part(rows: Array, keep: NDArray[np.bool_]) -> Array:
-    """Return the samples of rows (…, N) that take part."""
-    return rows if keep.all() else rows[..., keep]
 
 
 @dataclass(frozen=True)
@@ -170,14 +153,14 @@ class StreamSums:
 class _Passes:
     """Passes over a stream, each without the files that an earlier one could not read."""
 
-    problem: StreamProblem
+    settings: RegressionSettings
     stream: LogStream
     count: int = field(default=0, init=False)
 
     def sums(self, theta: Array | None, cut: Array | str | None) -> StreamSums:
         """Read the whole stream once."""
         self.count += 1
-        self.stream, found = self.stream.run(partial(sum_log, self.problem, theta, cut))
+        self.stream, found = self.stream.run(partial(sum_log, self.settings, theta, cut))
         made = [s for _, s in found]
         lost = tuple(s.diverged for s in made if s.diverged)
         away = sum(s.samples for s in made if s.diverged)
@@ -285,7 +268,7 @@ class Streamed:
 
 
 def estimate_sums(
-    problem: StreamProblem,
+    settings: RegressionSettings,
     stream: LogStream,
     data: EstimationData,
     start: Array | None,
@@ -295,7 +278,7 @@ def estimate_sums(
 
     Parameters
     ----------
-    problem : StreamProblem
+    settings : RegressionSettings
     stream : LogStream
     data : EstimationData
         What is known of the logs; samples are counted here.
@@ -313,8 +296,8 @@ def estimate_sums(
     LogError
         No file can be read any more.
     """
-    predictor = problem.predictor
-    passes = _Passes(problem, stream)
+    predictor = settings.predictor
+    passes = _Passes(settings, stream)
     iteration = Iteration()
     solutions: Sequence[Solution]
     if start is None:
@@ -339,32 +322,21 @@ def estimate_sums(
             predictor, start, "measured", passes.sums, partial(solve_sums, predictor), refine,
             settled,
         )  # fmt: skip
-    theta = np.concatenate([s.theta for s in solutions])
-    covariance = _covariance(predictor, sums, solutions)
-    centred = problem.zero_mean and start is not None
+    centred = settings.zero_mean and start is not None
     left = [
         [g.equations[row].squares(s.theta, centred=centred) for g in sums.groups]
         for row, s in enumerate(solutions)
     ]
-    vessel = stream.vessel
-    estimate = Estimate(
-        predictor=predictor,
-        method="ls" if start is None else "iv",
-        theta=theta,
-        covariance=covariance,
-        residual_std=np.sqrt(np.sum(left, axis=1) / max(sums.kept, 1)),
-        vessel=vessel,
-        sample_time=sums.stream.interval,
-        data=replace(data, samples=sums.samples, kept=sums.kept),
+    estimate = form_estimate(
+        settings,
+        "ls" if start is None else "iv",
+        solutions,
+        _covariance(predictor, sums, solutions),
+        np.sum(left, axis=1),
+        replace(data, samples=sums.samples, kept=sums.kept),
+        stream.vessel,
+        sums.stream.interval,
         covariance_kind="cluster",
-        lags=0,
         iteration=iteration,
-        current=estimate_current(
-            predictor,
-            theta,
-            covariance,
-            heading_std=vessel.std("psi") or 0.0,
-            heading_measured=problem.heading == "measured",
-        ),
     )
     return Streamed(estimate, sums, tuple(solutions), passes.count)

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from greybox.export.compiler import find_compiler, fmi_platform, shared_library
 from greybox.export.description import Variables, model_description
 from greybox.export.generate import c_functions, filled, template
 from greybox.export.names import comment, identifier
 from greybox.export.sampled import SampledModel
 from greybox.model.model import ManoeuvringModel
+from greybox.numerics.compiler import find_compiler, fmi_platform, shared_library
 
 # zip files know no earlier time
 _TIME = (1980, 1, 1, 0, 0, 0)

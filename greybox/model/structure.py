@@ -97,6 +97,10 @@ class Structure(DisplayMixin):
                 )
             keys[term.key] = term.name
 
+    def __hash__(self) -> int:
+        # every run looks up by it what was compiled: terms and their factors would take longer
+        return hash((self.name, self.parameters, self.states))
+
     @cached_property
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of ``theta``."""

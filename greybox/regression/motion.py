@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from greybox.model.predictor import Predictor
 from greybox.model.run.inputs import LogInputs
 from greybox.model.run.kernels import FreeRunKernel
+from greybox.model.run.simulation import beyond
 from greybox.model.run.step import Heading, StepModel, integrated
 from greybox.numerics.vectorised import Vectorised
 from greybox.regression.instruments import initial_state, smoothed_wind, state_bound
@@ -202,8 +203,7 @@ def predicted_motion(
     run.constants[0][:] = np.concatenate([theta, constants, [log.sample_time]])
     whole = np.vstack([start, run()[:-1]])
     x = whole[:, :nx]
-    with np.errstate(invalid="ignore"):
-        outside = np.asarray(~(np.abs(x) <= state_bound(log, structure.states)).all(axis=1))
+    outside = beyond(x, state_bound(log, structure.states))
     if outside.any() or states_only:
         diverged = int(outside.argmax()) if outside.any() else -1
         return Motion(x, np.empty((0, 0)), np.empty((0, 0, 0)), diverged)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Literal
 
@@ -27,14 +27,12 @@ _KEPT = 3
 
 
 @dataclass(frozen=True, eq=False)
-class RegressionProblem:
-    """Logs and a predictor of them.
+class RegressionSettings:
+    """A predictor, and how its regressors and instruments are formed from logs.
 
     Parameters
     ----------
     predictor : Predictor
-    logs : tuple of TrialLog
-        One experiment each, of one sample time.
     margins : mapping of str to float, optional
         Rows with |state| below are left out (Remark 4.2) [m/s, rad/s].
     zero_mean, heading, wind, lag
@@ -42,12 +40,48 @@ class RegressionProblem:
     """
 
     predictor: Predictor
+    margins: Mapping[str, float] | None = field(default=None, kw_only=True)
+    zero_mean: bool = field(default=True, kw_only=True)
+    heading: Literal["measured", "simulated"] = field(default="measured", kw_only=True)
+    wind: Literal["smoothed", "measured"] = field(default="smoothed", kw_only=True)
+    lag: int = field(default=0, kw_only=True)
+
+    def on(self, logs: Sequence[TrialLog]) -> RegressionProblem:
+        """Return the problem of logs that are in memory."""
+        own = {f.name: getattr(self, f.name) for f in fields(RegressionSettings)}
+        return RegressionProblem(logs=tuple(logs), **own)
+
+    def simulated(
+        self, logs: Sequence[TrialLog], theta: Array, keep: Keep | None = None
+    ) -> Instruments:
+        """Return the instruments of a model's parameters (p,), on its own rows or on given ones."""
+        return build_instruments(
+            self.predictor,
+            logs,
+            theta,
+            zero_mean=self.zero_mean,
+            heading=self.heading,
+            wind=self.wind,
+            lag=self.lag,
+            margins=self.margins,
+            keep=keep,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RegressionProblem(RegressionSettings):
+    """Settings and the logs in memory that they are for.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    logs : tuple of TrialLog
+        One experiment each, of one sample time.
+    settings
+        As `RegressionSettings`.
+    """
+
     logs: tuple[TrialLog, ...]
-    margins: Mapping[str, float] | None = None
-    zero_mean: bool = True
-    heading: Literal["measured", "simulated"] = "measured"
-    wind: Literal["smoothed", "measured"] = "smoothed"
-    lag: int = 0
     _instruments: OrderedDict[bytes, Instruments] = field(
         default_factory=OrderedDict, init=False, repr=False
     )
@@ -63,22 +97,12 @@ class RegressionProblem:
         return [e.keep for e in self.regression.experiments]
 
     def instruments(self, theta: Array, keep: Keep | None = None) -> Instruments:
-        """Return the instruments of a model's parameters (p,), on its own rows or on given ones."""
+        """Return the instruments as `simulated` does, kept for the next call."""
         rows = b"" if keep is None else b"".join(k.tobytes() for k in keep)
         key = np.asarray(theta, float).tobytes() + rows
         found = self._instruments.pop(key, None)
         if found is None:
-            found = build_instruments(
-                self.predictor,
-                self.logs,
-                theta,
-                zero_mean=self.zero_mean,
-                heading=self.heading,
-                wind=self.wind,
-                lag=self.lag,
-                margins=self.margins,
-                keep=keep,
-            )
+            found = self.simulated(self.logs, theta, keep)
         self._instruments[key] = found
         if len(self._instruments) > _KEPT:
             self._instruments.popitem(last=False)

@@ -19,7 +19,7 @@ from greybox.validation.fit import mean_fit
 
 _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
 # with more the page grows and tells nothing new
-_MOST_LOGS = 8
+MOST_LOGS = 8
 
 
 def headline(comparison: Comparison) -> str:
@@ -137,7 +137,8 @@ def _pictures(comparison: Comparison) -> list[Picture]:
     best = _best(comparison)
     by_log = [mean_fit(run.fit) for run in comparison.runs[best]]
     worst = int(np.argmin(by_log))
-    order = [worst, *(i for i in range(len(by_log)) if i != worst)][:_MOST_LOGS]
+    kept = [i for i, run in enumerate(comparison.runs[0]) if run.whole is None and i != worst]
+    order = [worst, *kept][:MOST_LOGS]
     drawn = len(order)
     shaded = sum(b is not None and bool(b.coverage) for row in comparison.bands for b in row[:1])
     curves = drawn * len(comparison.runs[0][0].fit) * (1 + 2 * len(comparison.names) + 4 * shaded)
@@ -147,7 +148,7 @@ def _pictures(comparison: Comparison) -> list[Picture]:
         runs = [row[i] for row in comparison.runs]
         bands = [row[i] for row in comparison.bands]
         caption = (
-            f"Free run on {first.log.name} ({len(first.log)} samples of "
+            f"Free run on {first.log.name} ({first.samples} samples of "
             f"{first.log.sample_time:g} s): measured, simulated, and their difference below."
         )
         if i == worst and len(by_log) > 1:
@@ -191,10 +192,10 @@ def _next_step(comparison: Comparison, record: Mapping[str, Any]) -> NextStep:
 
 def _left_out(comparison: Comparison) -> list[str]:
     count = len(comparison.runs[0])
-    if count <= _MOST_LOGS:
+    if count <= MOST_LOGS:
         return []
     return [
-        f"Of {count} logs the one of the lowest fit and the first {_MOST_LOGS - 1} others are "
+        f"Of {count} logs the one of the lowest fit and the first {MOST_LOGS - 1} others are "
         f"drawn; all are in the tables."
     ]
 

@@ -14,14 +14,14 @@ from greybox.estimation.problem import EstimationOptions, EstimationProblem, Fit
 from greybox.estimation.refined import add_noise
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
-from greybox.estimation.streamed import Streamed, StreamProblem, estimate_sums
+from greybox.estimation.streamed import Streamed, estimate_sums
 from greybox.model.predictor import Predictor
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.numerics.effort import within
 from greybox.public import one_thread
-from greybox.regression.problem import RegressionProblem
+from greybox.regression.problem import RegressionProblem, RegressionSettings
 from greybox.selection.estimate import estimate_requested, weighed, with_runs
-from greybox.selection.prediction import part_of_estimate, refit_alike, with_prediction
+from greybox.selection.prediction import refit_alike, with_prediction
 from greybox.selection.request import Request
 from greybox.selection.stretches import Drawn
 
@@ -60,15 +60,7 @@ class StreamEstimate:
             "passes": self.streamed.passes,
             "segments_without_bounded_simulation": list(self.streamed.sums.lost),
             "left_out": list(stream.left_out),
-            "drawn": {
-                "rests_on_it": ["predictor", "noise", "tests", "prediction", "fit"],
-                "samples": self.drawn.samples,
-                "share": self.drawn.share,
-                "stretches": [
-                    {"name": log.name, "start": float(log.t[0]), "samples": len(log)}
-                    for log in self.drawn.logs
-                ],
-            },
+            "drawn": self.drawn.to_dict(["predictor", "noise", "tests", "prediction", "fit"]),
         }
 
 
@@ -125,7 +117,7 @@ def estimate_stream(
     """
     require_adding(request)
     logs = list(drawn.logs)
-    _require_others(drawn, request)
+    drawn.require_others(request.validate)
     notes: list[str] = []
     if request.method is None:
         notes.append(
@@ -141,9 +133,9 @@ def estimate_stream(
     problem = EstimationProblem(tuple(logs), first.predictor.structure, kind, **asked)
     instruments = ESTIMATORS[request.method or ""].instruments
     closed, loop_test = problem.loop_test(request.method or "")
-    settings = StreamProblem(
+    settings = RegressionSettings(
         first.predictor,
-        request.margins,
+        margins=request.margins,
         zero_mean=request.zero_mean and instruments,
         heading=request.heading,
         wind=problem.instrument_wind,
@@ -157,10 +149,7 @@ def estimate_stream(
 
     streamed, dropped = problem.drop_unexcited(first.predictor, fit)
     estimate = streamed.estimate
-    regression = RegressionProblem(
-        estimate.predictor, tuple(logs), request.margins, settings.zero_mean, settings.heading,
-        settings.wind, settings.lag,
-    )  # fmt: skip
+    regression = replace(settings, predictor=estimate.predictor).on(logs)
     # how the estimate on the stretches ended says nothing of this one
     ended = ESTIMATORS[first.method].ended.format(status=first.status)
     notes += [*(n for n in first.notes if n != ended), *dropped, drawn.sentence]
@@ -177,14 +166,6 @@ def estimate_stream(
             estimate = with_prediction(estimate, logs, request, refit_alike(estimate, request))
     told = (*streamed.sums.stream.left_out, *estimate.notes)
     return StreamEstimate(replace(estimate, notes=told), drawn, streamed)
-
-
-def _require_others(drawn: Drawn, request: Request) -> None:
-    """Refuse a log that validates and is a file of the stream, drawn from or not."""
-    files = {f.known.sha256 for f in drawn.stream.parts}
-    for log in request.validate:
-        if log.provenance.sha256 in files:
-            raise part_of_estimate(log)
 
 
 def _judged(estimate: Estimate, streamed: Streamed, regression: RegressionProblem) -> Estimate:

@@ -74,7 +74,9 @@ def estimate_ls(
     ----------
     Ljungberg (2020), eq. 2.17.
     """
-    problem = RegressionProblem(predictor, tuple(as_segments(logs)), margins, zero_mean=False)
+    problem = RegressionProblem(
+        predictor, tuple(as_segments(logs)), margins=margins, zero_mean=False
+    )
     return _estimate(solve_ls(problem), covariance, seed, judged)
 
 
@@ -147,8 +149,9 @@ def estimate_iv(
     Ljungberg (2020), eqs. 2.21, 4.5, 4.60-4.63; Young (2008).
     """
     problem = RegressionProblem(
-        predictor, tuple(as_segments(logs)), margins, zero_mean, heading, wind, lag
-    )
+        predictor, tuple(as_segments(logs)), margins=margins, zero_mean=zero_mean,
+        heading=heading, wind=wind, lag=lag,
+    )  # fmt: skip
     solved = solve_iv(problem, start=start, refine=refine, metric=metric)
     return _estimate(solved, covariance, seed, judged)
 

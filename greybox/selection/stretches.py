@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from greybox.estimation.values import EstimationData
 from greybox.model.predictor import Predictor, build_predictor
 from greybox.model.structure import Structure
 from greybox.regression.regression import build_experiment
+from greybox.selection.prediction import part_of_estimate
 from greybox.trial.actuator_estimate import known_actuators
 from greybox.trial.log import TrialLog
 from greybox.trial.stream import LogStream, Place
@@ -63,10 +65,41 @@ class Drawn:
         return (
             f"the coefficients and their standard errors rest on all {self.data.samples} samples, "
             f"which were read in passes; the choice of the predictor, noise levels, tests, fit and "
-            f"the verdict on the prediction rest on {self.samples} of them "
-            f"({100 * self.share:.3g} %) in {len(self.logs)} stretches, those that tell the "
-            f"parameters apart best."
+            f"the verdict on the prediction rest on {self.part}."
         )
+
+    @property
+    def part(self) -> str:
+        """How many samples they hold, in words."""
+        return (
+            f"{self.samples} of them ({100 * self.share:.3g} %) in {len(self.logs)} stretches, "
+            f"those that tell the parameters apart best"
+        )
+
+    def to_dict(self, rests_on_it: Sequence[str]) -> dict[str, Any]:
+        """Return the stretches for JSON, with what rests on them."""
+        return {
+            "rests_on_it": list(rests_on_it),
+            "samples": self.samples,
+            "share": self.share,
+            "stretches": [
+                {"name": log.name, "start": float(log.t[0]), "samples": len(log)}
+                for log in self.logs
+            ],
+        }
+
+    def require_others(self, logs: Sequence[TrialLog]) -> None:
+        """Refuse logs that validate and are files of the stream, drawn from or not.
+
+        Raises
+        ------
+        UsageError
+            Names the log.
+        """
+        files = {f.known.sha256 for f in self.stream.parts}
+        for log in logs:
+            if log.provenance.sha256 in files:
+                raise part_of_estimate(log)
 
 
 @dataclass(frozen=True)

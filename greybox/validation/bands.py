@@ -7,7 +7,7 @@ the run, the heading and wind that drive it, and what moves the ship beside the 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -95,6 +95,12 @@ class Bands:
     runs: int
     diverged: int
     missing: tuple[str, ...]
+
+    def without_samples(self) -> Bands:
+        """Return what a table tells of the bands: their limits at the last sample alone."""
+        # limits end where too many draws diverge, so the last ones tell whether they did
+        motion, measurement = self.motion[:, -1:].copy(), self.measurement[:, -1:].copy()
+        return replace(self, motion=motion, measurement=measurement)
 
     @property
     def notes(self) -> tuple[str, ...]:

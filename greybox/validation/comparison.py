@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -16,10 +16,9 @@ from greybox.model.model import ManoeuvringModel
 from greybox.notebook import DisplayMixin, items, number, table
 from greybox.public import known_keywords, one_thread
 from greybox.trial.log import Logs, TrialLog, as_list
-from greybox.trial.segments import find_log_gaps
 from greybox.trial.validity import ConditionDifference, other_conditions
 from greybox.validation.bands import LEVEL, Bands, predict_bands
-from greybox.validation.fit import LogFit, run_from, run_model
+from greybox.validation.fit import LogFit, mean_fit, run_from, run_model
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,6 +27,9 @@ Array = NDArray[np.float64]
 
 HORIZONS = (10.0, 30.0, 60.0)
 _MOST_STARTS = 300
+# what a comparison holds in memory for each sample of a log and model: 0.25 kB were measured,
+# with Parquet files of 60,000 samples
+BYTES = 512
 
 
 @dataclass(frozen=True)
@@ -106,8 +108,8 @@ class Comparison(DisplayMixin):
                     "logs": [
                         {
                             "log": run.log.name,
-                            "samples": len(run.log),
-                            "gaps": [g.to_dict() for g in find_log_gaps(run.log)],
+                            "samples": run.samples,
+                            "gaps": [g.to_dict() for g in run.gaps],
                             "fit": run.fit,
                             "rmse": rmse,
                             "ahead": ahead,
@@ -182,7 +184,7 @@ class Comparison(DisplayMixin):
             for name, differences in zip(self.names, self.conditions, strict=True)
             for d in differences
         ]
-        told = (g.sentence for row in self.runs for run in row for g in find_log_gaps(run.log))
+        told = (g.sentence for row in self.runs for run in row for g in run.gaps)
         lines += [f"note: {sentence}" for sentence in dict.fromkeys((*self.notes, *told))]
         if len(self.runs[0]) > 1:
             lines += [t.sentence for t in self.sign_tests]
@@ -358,7 +360,8 @@ def compare(
             )
     if not known:
         raise UsageError("there is no model to compare: give at least one, by name.")
-    return _compare(list(known.values()), list(known), lists, heading, bands, seed)
+    columns = zip(*lists, strict=True)
+    return compare_each(known, columns, heading=heading, bands=bands, seed=seed)
 
 
 def compare_models(
@@ -405,19 +408,86 @@ def compare_models(
             f"{len(models)} models and {len(names)} names have {of_logs}, and each needs a list of "
             f"its own: write compare({{name: model}}, logs), which takes one list for all."
         )
-    lists = [as_list(mine) for mine in logs]
-    return _compare(models, names, lists, heading, bands, seed)
+    known = dict(zip(names, models, strict=True))
+    columns = zip(*(as_list(mine) for mine in logs), strict=True)
+    return compare_each(known, columns, heading=heading, bands=bands, seed=seed)
 
 
-@one_thread
-def _compare(
-    models: Sequence[ManoeuvringModel],
-    names: Sequence[str],
-    logs: Sequence[Sequence[TrialLog]],
+@dataclass(frozen=True)
+class _Compared:
+    """One model on one log: what `Comparison` holds of it."""
+
+    run: LogFit
+    rmse: dict[str, float]
+    ahead: dict[str, dict[str, float]]
+    band: Bands | None
+
+    def without_samples(self) -> _Compared:
+        """Return what tables tell."""
+        band = self.band and self.band.without_samples()
+        return replace(self, run=self.run.without_samples(), band=band)
+
+
+def _compared(
+    model: ManoeuvringModel,
+    log: TrialLog,
     heading: Literal["measured", "simulated"],
     bands: bool,
     seed: int,
+) -> _Compared:
+    """Run a model on a log."""
+    run = run_model(model, log, heading=heading)
+    stays = run.diverged < 0
+    rmse = {
+        s: float(np.sqrt(np.nanmean((run.log.measured(s) - run.x[:, i]) ** 2)))
+        if stays
+        else float("inf")
+        for i, s in enumerate(model.structure.states)
+    }
+    band = predict_bands(model, run.log, heading=heading, seed=seed) if bands and stays else None
+    return _Compared(run, rmse, errors_ahead(model, run, heading), band)
+
+
+def _to_keep(rows: Sequence[Sequence[_Compared]], most: int) -> set[int]:
+    """Return which logs stay whole: the first ones, and that which each model fits worst."""
+    fits = [[mean_fit(one.run.fit) for one in row] for row in rows]
+    return {*range(min(most, len(rows[0]))), *(int(np.argmin(f)) for f in fits if most)}
+
+
+@one_thread
+def compare_each(
+    known: Mapping[str, ManoeuvringModel],
+    columns: Iterable[Sequence[TrialLog]],
+    *,
+    heading: Literal["measured", "simulated"] = "measured",
+    bands: bool = True,
+    seed: int = 0,
+    whole: int | None = None,
 ) -> Comparison:
+    """Run every model freely on one log after another.
+
+    Parameters
+    ----------
+    known : mapping of str to ManoeuvringModel
+    columns : iterable of sequence of TrialLog
+        One log after another, each as every model reads it; none is asked for before the one
+        before it was compared.
+    heading, bands, seed
+        As `compare`.
+    whole : int, optional
+        Of so many logs, the first ones and those that fit worst, samples are kept for pictures;
+        of the others only what the tables tell. By default all are kept.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    UsageError
+        Models differ in their states.
+    """
+    names, models = tuple(known), list(known.values())
     states = {model.structure.states for model in models}
     if len(states) > 1:
         one, two = sorted(states)[:2]
@@ -425,42 +495,32 @@ def _compare(
             f"models with the states {', '.join(one)} and {', '.join(two)} cannot stand in one "
             f"table: compare those of the same states."
         )
-    runs = tuple(
-        tuple(run_model(model, log, heading=heading) for log in mine)
-        for model, mine in zip(models, logs, strict=True)
-    )
-    rmse = tuple(
-        tuple(
-            {
-                s: float(np.sqrt(np.nanmean((r.log.measured(s) - r.x[:, i]) ** 2)))
-                if r.diverged < 0
-                else float("inf")
-                for i, s in enumerate(model.structure.states)
-            }
-            for r in row
-        )
-        for model, row in zip(models, runs, strict=True)
-    )
-    ahead = tuple(
-        tuple(errors_ahead(model, r, heading) for r in row)
-        for model, row in zip(models, runs, strict=True)
-    )
+    rows: list[list[_Compared]] = [[] for _ in models]
+    for logs in columns:
+        for model, log, row in zip(models, logs, rows, strict=True):
+            row.append(_compared(model, log, heading, bands, seed))
+        keep = set(range(len(rows[0]))) if whole is None else _to_keep(rows, whole)
+        for row in rows:
+            row[:] = [
+                one if k in keep or one.run.whole else one.without_samples()
+                for k, one in enumerate(row)
+            ]
+    runs = tuple(tuple(one.run for one in row) for row in rows)
     tests = [
         sign_test(name, names[0], s, [r.fit[s] for r in runs[0]], [r.fit[s] for r in row])
         for name, row in zip(names[1:], runs[1:], strict=True)
         for s in runs[0][0].fit
         if s in row[0].fit
     ]
-    drawn = tuple(
+    return Comparison(
+        names,
+        runs,
+        tuple(tuple(one.rmse for one in row) for row in rows),
+        tuple(tuple(one.ahead for one in row) for row in rows),
+        tuple(tests),
+        tuple(tuple(one.band for one in row) for row in rows),
         tuple(
-            predict_bands(model, r.log, heading=heading, seed=seed)
-            if bands and r.diverged < 0
-            else None
-            for r in row
-        )
-        for model, row in zip(models, runs, strict=True)
+            other_conditions(model.conditions, [run.log for run in row])
+            for model, row in zip(models, runs, strict=True)
+        ),
     )
-    elsewhere = tuple(
-        other_conditions(model.conditions, mine) for model, mine in zip(models, logs, strict=True)
-    )
-    return Comparison(tuple(names), runs, rmse, ahead, tuple(tests), drawn, elsewhere)

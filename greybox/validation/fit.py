@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -20,7 +21,13 @@ from greybox.notebook import DisplayMixin, number, sparkline, table
 from greybox.regression.instruments import simulate_log, state_bound
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
-from greybox.trial.segments import join_segments, split_segments, whole_name
+from greybox.trial.segments import (
+    LogGaps,
+    find_log_gaps,
+    join_segments,
+    split_segments,
+    whole_name,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,6 +35,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _HUGE = 1e6
+# samples that a log has at least
+_HEAD = 2
 
 
 def fit_percent(measured: Array, simulated: Array) -> Array:
@@ -87,6 +96,8 @@ class LogFit(DisplayMixin):
         (6.12) per state [%]; −inf where the run diverged.
     diverged : int
         First sample outside the bound, −1 if none.
+    whole : tuple of (int, tuple of LogGaps), optional
+        Samples and gaps of the log, where only its first samples are kept.
     """
 
     log: TrialLog
@@ -94,6 +105,24 @@ class LogFit(DisplayMixin):
     psi: Array
     fit: dict[str, float]
     diverged: int
+    whole: tuple[int, tuple[LogGaps, ...]] | None = None
+
+    @property
+    def samples(self) -> int:
+        """Samples of the log, kept or not."""
+        return len(self.log) if self.whole is None else self.whole[0]
+
+    @property
+    def gaps(self) -> tuple[LogGaps, ...]:
+        """Gaps of the log, kept or not."""
+        return find_log_gaps(self.log) if self.whole is None else self.whole[1]
+
+    def without_samples(self) -> LogFit:
+        """Return what a table tells of the run, without the samples of log and run."""
+        # copies: a view would keep all samples
+        head = copy.deepcopy(self.log.window(0, _HEAD, self.log.name))
+        x, psi = self.x[:_HEAD].copy(), self.psi[:_HEAD].copy()
+        return replace(self, log=head, x=x, psi=psi, whole=(self.samples, self.gaps))
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the run beside its log.

@@ -65,6 +65,22 @@ def test_a_folder_is_compared_and_checked_file_by_file(folder, tmp_path):
     assert len(json.loads(out.read_text())["logs"]) == 3
 
 
+def test_a_folder_beyond_the_memory_is_compared_with_the_same_numbers(
+    folder, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("greybox.report.comparison.MOST_LOGS", 1)
+    model, found = tmp_path / "model.json", []
+    main(["estimate", str(folder / "day0.csv"), *OPTIONS, "--out", str(model)])
+    for k, memory in enumerate((4, 1e-9)):
+        out, page = tmp_path / f"{k}.json", tmp_path / f"{k}.html"
+        main(["compare", str(model), "--log", str(folder), "--json", str(out),
+              "--memory", str(memory), "--report", str(page)])  # fmt: skip
+        found.append(json.loads(out.read_text()) | {"provenance": None})
+        assert "fits worst" in page.read_text()
+    assert found[0] == found[1]
+    assert [log["samples"] for log in found[1]["models"][0]["logs"]] == [400] * 3
+
+
 def test_logs_beyond_the_memory_are_read_in_passes(folder, tmp_path, capsys):
     named, _ = estimated(tmp_path, folder)
     found, _ = estimated(tmp_path, folder, "--memory", "0.001")
@@ -77,6 +93,44 @@ def test_logs_beyond_the_memory_are_read_in_passes(folder, tmp_path, capsys):
     assert any("rest on 1200 of them (100 %) in 3 stretches" in n for n in found["notes"])
     assert {t.split("_")[0] for t in found["tests"]} >= {"relevance", "input", "stability"}
     assert found["verdict"]["prediction"]["level"] in ("good", "limited", "poor")
+
+
+def test_logs_beyond_the_memory_are_diagnosed_on_stretches(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("greybox.selection.stretches._DRAWN", 800)
+    model, out = tmp_path / "model.json", tmp_path / "d.json"
+    main(["estimate", str(folder / "day0.csv"), *OPTIONS, "--out", str(model)])
+    asked = ["diagnose", str(folder), "--vessel", "thesis", "--model", str(model), "--causes",
+             "input_delay", "--memory", "0.001"]  # fmt: skip
+    main([*asked, "--json", str(out)])
+    found = json.loads(out.read_text())
+    assert (found["stream"]["files"], found["stream"]["rows"]) == (3, 1200)
+    assert found["stream"]["drawn"]["share"] == pytest.approx(2 / 3)
+    assert any("rests on 800 of them (66.7 %) in 2 stretches" in n for n in found["notes"])
+    assert len(found["provenance"]["logs"]) == 2
+    assert main([*asked, "--validate", str(folder / "day2.csv")]) == 1
+
+
+def test_logs_beyond_the_memory_are_checked_in_groups(folder, tmp_path, capsys):
+    found = []
+    for name, memory in (("whole", 4), ("groups", 0.00045)):
+        out, page = tmp_path / f"{name}.json", tmp_path / f"{name}.html"
+        main(["check", str(folder), "--vessel", "thesis", "--memory", str(memory),
+              "--json", str(out), "--report", str(page)])  # fmt: skip
+        found.append(json.loads(out.read_text()))
+        assert page.exists()
+    whole, groups = found
+    assert groups["provenance"]["judged_together"] == [["day0.csv", "day1.csv"], ["day2.csv"]]
+    assert (
+        "3 logs take more than --memory, and were judged together in 2" in capsys.readouterr().out
+    )
+    # what each log is judged by alone is the same
+    for a, b in zip(whole["logs"], groups["logs"], strict=True):
+        assert (a["log"], a["regimes"], a["manoeuvres"]) == (
+            b["log"],
+            b["regimes"],
+            b["manoeuvres"],
+        )
+    assert "judged_together" not in whole["provenance"]
 
 
 def test_a_broken_file_of_a_stream_is_left_out_and_named(folder, tmp_path):

@@ -21,7 +21,7 @@ def fit(problem: EstimationProblem) -> Fitted:
 
     def solve(predictor: Predictor) -> Solved:
         return solve_ls(
-            RegressionProblem(predictor, problem.logs, problem.margins, zero_mean=False)
+            RegressionProblem(predictor, problem.logs, margins=problem.margins, zero_mean=False)
         )
 
     def shrink(solved: Solved, notes: list[str]) -> Fitted:

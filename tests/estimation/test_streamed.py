@@ -12,10 +12,10 @@ from virtual import virtual_log
 from greybox.errors import ExcitationError, LogError, UsageError
 from greybox.estimation.normal_equations import Sums, solve_stacked
 from greybox.estimation.solve import _structure_theta, solve_iv, solve_ls
-from greybox.estimation.streamed import StreamProblem, _Passes, estimate_sums, solve_sums
+from greybox.estimation.streamed import _Passes, estimate_sums, solve_sums
 from greybox.estimation.values import EstimationData
 from greybox.model.predictor import build_predictor
-from greybox.regression.problem import RegressionProblem
+from greybox.regression.problem import RegressionProblem, RegressionSettings
 from greybox.trial import stream as streams
 from greybox.trial.convert.read import read_segments
 from greybox.trial.log_files import LogFile, find_logs
@@ -140,7 +140,7 @@ def test_least_squares_of_a_stream_is_that_of_all_samples(folder, ship, thesis):
     _, found = stream.run(len)
     logs = tuple(stream.read([p for p, _ in found]))
     whole = solve_ls(RegressionProblem(predictor, logs, zero_mean=False)).estimate("cluster")
-    problem = StreamProblem(predictor, zero_mean=False)
+    problem = RegressionSettings(predictor, zero_mean=False)
     own = estimate_sums(problem, stream, data(), None).estimate
     np.testing.assert_allclose(own.theta, whole.theta, rtol=1e-8)
     np.testing.assert_allclose(own.residual_std, whole.residual_std, rtol=1e-9)
@@ -161,7 +161,7 @@ def test_one_segment_is_estimated_as_it_is_in_memory(folder, ship, thesis):
 def estimate_sums_of(predictor, stream, expected):
     """One segment has no spread between segments, so only its equations are solved."""
     start = _structure_theta(predictor, expected.theta)
-    sums = _Passes(StreamProblem(predictor), stream).sums(start, "measured")
+    sums = _Passes(RegressionSettings(predictor), stream).sums(start, "measured")
     return np.concatenate([s.theta for s in solve_sums(predictor, sums)])
 
 
@@ -172,7 +172,7 @@ def test_a_stream_solves_with_its_instruments_summed_over_all_segments(
     stream = opened(folder, ship)
     _, found = stream.run(len)
     logs = tuple(stream.read([p for p, _ in found]))
-    sums = _Passes(StreamProblem(predictor), stream).sums(true_theta, "measured")
+    sums = _Passes(RegressionSettings(predictor), stream).sums(true_theta, "measured")
     problem = RegressionProblem(predictor, logs)
     made = problem.instruments(true_theta)
     experiments = problem.regression.experiments
@@ -191,7 +191,7 @@ def test_standard_errors_are_about_those_in_memory(folder, ship, thesis, small):
     _, found = stream.run(len)
     logs = tuple(stream.read([p for p, _ in found]))
     expected = solve_iv(RegressionProblem(predictor, logs)).estimate("cluster")
-    problem = StreamProblem(predictor)
+    problem = RegressionSettings(predictor)
     own = estimate_sums(problem, stream, data(), expected.structure_theta()).estimate
     assert own.converged
     # the first move tells nothing of the next one
@@ -234,7 +234,7 @@ def test_a_file_that_vanishes_is_named_and_the_rest_is_estimated(
     stream = opened(tmp_path, ship)
     (tmp_path / "day1.parquet").unlink()
     predictor = build_predictor(thesis, "augmented", REGIME, intercept=True)
-    made = estimate_sums(StreamProblem(predictor, zero_mean=False), stream, data(), None)
+    made = estimate_sums(RegressionSettings(predictor, zero_mean=False), stream, data(), None)
     assert made.estimate.samples == 11_897
     (told,) = made.sums.stream.left_out
     assert "day1.parquet" in told
@@ -264,7 +264,7 @@ def test_one_segment_has_no_spread(folder, ship, thesis):
     stream = open_stream([LogFile(str(folder / "day1.parquet"))], ship)
     one = replace(stream, files=(replace(stream.files[0], cuts=(0, 6000), numbers=(0,)),))
     with pytest.raises(ExcitationError, match="the stream holds 1 segment"):
-        estimate_sums(StreamProblem(predictor, zero_mean=False), one, data(), None)
+        estimate_sums(RegressionSettings(predictor, zero_mean=False), one, data(), None)
 
 
 def test_a_stream_is_read_from_csv_too(folder, ship, tmp_path, small):

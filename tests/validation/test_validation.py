@@ -32,7 +32,7 @@ from greybox.model.predictor import build_predictor
 from greybox.selection.estimate import estimate_model
 from greybox.selection.fit_single import estimate_iv, estimate_ls
 from greybox.trial.log import make_log
-from greybox.validation.comparison import compare, sign_test
+from greybox.validation.comparison import compare, compare_each, sign_test
 from greybox.validation.fit import fit_percent, run_model
 
 
@@ -120,6 +120,18 @@ def test_comparison_tells_models_apart(thesis_model, clean_log, noisy_log):
     )
     json.dumps(c.to_dict())
     assert "fit u [%]" in c.summary()
+
+
+def test_only_tables_are_kept_of_logs_that_are_not_drawn(thesis_model, noisy_log):
+    columns = [[noisy_log.window(k, k + 300)] for k in (0, 300, 600)]
+    known = {"thesis": thesis_model}
+    whole = compare_each(known, columns)
+    for most, kept in ((0, 0), (1, 2)):
+        found = compare_each(known, columns, whole=most)
+        assert sum(run.whole is None for run in found.runs[0]) <= kept
+        assert sum(len(run.log) for run in found.runs[0]) <= 300 * kept + 2 * 3
+        assert found.to_dict() == whole.to_dict()
+        assert found.summary() == whole.summary()
 
 
 def test_sign_test_is_binomial():

@@ -30,8 +30,9 @@ def _fit(problem: EstimationProblem) -> Fitted:
 
     def plain(predictor: Predictor) -> Solved:
         regression = RegressionProblem(
-            predictor, problem.logs, problem.margins, problem.zero_mean, problem.heading, wind, lag
-        )
+            predictor, problem.logs, margins=problem.margins, zero_mean=problem.zero_mean,
+            heading=problem.heading, wind=wind, lag=lag,
+        )  # fmt: skip
         return solve_iv(regression, start=problem.nominal_theta, refine=problem.refine)
 
     def finish(solved: Solved, notes: list[str]) -> Fitted:

@@ -19,7 +19,7 @@ def _fit(problem: EstimationProblem) -> Fitted:
 
     def fit(predictor: Predictor) -> Solved:
         return solve_ls(
-            RegressionProblem(predictor, problem.logs, problem.margins, zero_mean=False)
+            RegressionProblem(predictor, problem.logs, margins=problem.margins, zero_mean=False)
         )
 
     def finish(solved: Solved, notes: list[str]) -> Fitted:

@@ -4,7 +4,8 @@ A step takes two compiled forms, chosen by measurement. A few runs: some steps u
 into one scalar function, accumulated over the log. Many runs: the same instructions on
 vectors with one element a run. (5000 undisturbed steps on one core: one run 3 ms by the
 first form; 500 runs 0.08 s by the second, 0.5 s by the first, 1.1 s by a plain
-mapaccum of the step.) NumPy buffers go in and out without conversion.
+mapaccum of the step.) NumPy buffers go in and out without conversion. Long runs of a few ships
+take machine code in place of the first form where that pays, see `greybox.model.run.compiled`.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.model.run.compiled import loop_of
 from greybox.model.run.step import StepModel
 
 Array = NDArray[np.float64]
@@ -202,18 +205,41 @@ class FreeRunKernel:
         self._read = np.zeros((padded, step.size1_in(1)))
         self.read = self._read[:samples]
         self.constants = [np.zeros(step.size1_in(i)) for i in range(2, step.n_in())]
-        self._states = np.zeros((padded, len(self.start)))
-        self._buffer, self._trigger = along(step, 1, padded, 1).buffer()
-        for i, argument in enumerate((self.start, self._read, *self.constants)):
-            bind(self._buffer.set_arg, i, argument)
-        bind(self._buffer.set_res, 0, self._states)
+        self._step, self._loop = step, loop_of(step, 1)
+        self._given = (self.start, self._read, *self.constants)
 
-    def __call__(self) -> Array:
-        """Run, and return the states after each step (N, nx), which the next call overwrites."""
+    @cached_property
+    def _interpreted(self) -> tuple[Any, Callable[[], None]]:
+        buffer, trigger = along(self._step, 1, len(self._read), 1).buffer()
+        for i, argument in enumerate(self._given):
+            bind(buffer.set_arg, i, argument)
+        return buffer, trigger
+
+    @cached_property
+    def _states(self) -> Array:
+        return np.empty((len(self._read), len(self.start)))
+
+    def __call__(self, out: Array | None = None) -> Array:
+        """Run, and return the states after each step (N, nx).
+
+        Parameters
+        ----------
+        out : ndarray, optional
+            (N, nx), contiguous, to be filled; else the next call overwrites what is returned.
+        """
         samples = len(self.read)
+        if self._loop.pays(samples):
+            out = self._states[:samples] if out is None else out
+            self._loop(samples, self._given, (out,))
+            return out
+        buffer, trigger = self._interpreted
         self._read[samples:] = self._read[samples - 1]
-        self._trigger()
-        return self._states[:samples]
+        bind(buffer.set_res, 0, self._states)
+        trigger()
+        if out is None:
+            return self._states[:samples]
+        out[:] = self._states[:samples]
+        return out
 
 
 @lru_cache(maxsize=32)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.model.output import OutputModel
+from greybox.model.run.compiled import loop_of
 from greybox.model.run.kernels import along, bind
 from greybox.model.run.output_step import (
     StepBuilder,
@@ -37,13 +38,12 @@ _NEAR = 128
 
 
 @lru_cache(maxsize=32)
-def _along_runs(build: StepBuilder, model: OutputModel, steps: int, runs: int) -> ca.Function:
-    """Return the step taken over the samples of runs side by side, without derivatives."""
+def _plain_step(build: StepBuilder, model: OutputModel) -> ca.Function:
+    """Return the step without derivatives."""
     of = build(model)
-    step = ca.Function(
+    return ca.Function(
         "step", [*of.carried, of.read, *of.constant], [*of.next, *of.results], {"cse": True}
     )
-    return along(step, len(of.carried), steps, runs)
 
 
 @dataclass(frozen=True)
@@ -136,19 +136,26 @@ class _Runs:
         self._evaluate = _Evaluator()
         self._blocks: dict[bool, list[tuple[slice, Array, dict[int, Any]]]] = {}
         # those of the module are found by the hash of a model, which takes longer
-        self._along: ca.Function | None = None
         self._tables: dict[bool, _Table] = {}
 
     def __call__(
         self, carried: Sequence[Array], constant: Sequence[Array]
     ) -> tuple[list[Array], list[Array]]:
         """Return what is carried after each step, and what is found, each (M, m, ·)."""
-        if self._along is None:
-            self._along = _along_runs(self._build, self._model, self.steps, self.runs)
-        shapes = map(self._along.size1_out, range(self._along.n_out()))
-        out = [np.empty((self.runs, self.steps, size)) for size in shapes]
-        self._evaluate(self._along, (*carried, self._read, *constant), tuple(out))
-        return out[: len(carried)], out[len(carried) :]
+        step, count = _plain_step(self._build, self._model), len(carried)
+        loop = loop_of(step, count)
+        out = [np.empty((self.runs, self.steps, step.numel_out(i))) for i in range(step.n_out())]
+        if loop.pays(self.runs * self.steps):
+            start, fixed = (
+                [np.ascontiguousarray(a, float) for a in x] for x in (carried, constant)
+            )
+            for k in range(self.runs):
+                given = [*(a[k] for a in start), self._read[k], *fixed]
+                loop(self.steps, given, [a[k] for a in out])
+        else:
+            function = along(step, count, self.steps, self.runs)
+            self._evaluate(function, (*carried, self._read, *constant), tuple(out))
+        return out[:count], out[count:]
 
     def _prepared(
         self, table: _Table, first: int, starts: bool

@@ -205,10 +205,19 @@ def simulate(
         angle = np.zeros((runs, samples + 1))
     if bound is None:
         bound = np.full(nx, 1e6)
-    with np.errstate(invalid="ignore"):
-        outside = np.asarray(~(np.abs(x) <= bound).all(axis=2))
+    outside = beyond(x, bound)
     diverged = np.where(outside.any(axis=1), outside.argmax(axis=1), -1)
     return FreeRun(x, angle, diverged, np.asarray(bound, float))
+
+
+def beyond(x: Array, bound: Array) -> NDArray[np.bool_]:
+    """Return where some state (..., nx) is past its bound (nx,), or no number, (...)."""
+    outside = np.zeros(x.shape[:-1], bool)
+    # state by state: a reduction over the few states of each sample takes ten times as long
+    with np.errstate(invalid="ignore"):
+        for state, most in enumerate(bound):
+            outside |= ~(np.abs(x[..., state]) <= most)
+    return outside
 
 
 def _common_runs(given: Mapping[str, tuple[Any, tuple[int, ...]]]) -> int:
@@ -257,7 +266,7 @@ def _few(
         np.concatenate([part[run] for part in series], axis=1, out=kernel.read)
         kernel.start[:] = out[run, 0]
         kernel.constants[0][:] = theta[run]
-        out[run, 1:] = kernel()
+        kernel(out[run, 1:])
 
 
 def _many(

@@ -95,6 +95,18 @@ def check_files(paths: Sequence[str | Path], vessel: Vessel) -> list[CheckReport
     UsageError
         A file is named twice: its evidence would count twice.
     """
+    require_each_once(paths)
+    return check_recordings([read_recording(path, vessel) for path in paths], vessel)
+
+
+def require_each_once(paths: Sequence[str | Path]) -> None:
+    """Raise where a file is named twice.
+
+    Raises
+    ------
+    UsageError
+        Names the file.
+    """
     places = [Path(path).resolve() for path in paths]
     twice = next((p for p in places if places.count(p) > 1), None)
     if twice is not None:
@@ -102,7 +114,6 @@ def check_files(paths: Sequence[str | Path], vessel: Vessel) -> list[CheckReport
             f"'{twice.name}' is named {places.count(twice)} times and would count as as many "
             f"logs: name each log once."
         )
-    return check_recordings([read_recording(path, vessel) for path in paths], vessel)
 
 
 def check_recording(recording: Recording, vessel: Vessel) -> CheckReport:

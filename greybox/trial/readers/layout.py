@@ -21,6 +21,8 @@ _HEAD_LINES = 60
 _MAX_NOTED = 5
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _END = re.compile(r"\r\n|\r|\n")
+# control characters beside tab, ends of lines and pages
+_CONTROL = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
 _MARKS = "#%"
 
 
@@ -191,7 +193,7 @@ def _head(path: Path) -> tuple[list[str], str]:
         raise LogError(f"'{path.name}' is empty: name a log with a header line and samples.")
     encoding = _encoding(path, raw)
     text = raw.decode(encoding, errors="replace").removeprefix("\ufeff")
-    control = sum(c < " " and c not in "\t\r\n\f" for c in text[:_FIRST_BYTES])
+    control = len(_CONTROL.findall(text[:_FIRST_BYTES]))
     if control > 0.01 * min(len(text), _FIRST_BYTES):
         raise LogError(
             f"'{path.name}' holds {control} control characters in its first "

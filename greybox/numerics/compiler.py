@@ -16,7 +16,7 @@ from greybox.errors import ExportError
 
 _LIMIT = 300
 # contracted products would differ from machine to machine
-_FLAGS = ("-shared", "-fPIC", "-O2", "-ffp-contract=off", "-fvisibility=hidden")
+FLAGS = ("-shared", "-fPIC", "-O2", "-ffp-contract=off", "-fvisibility=hidden")
 
 
 def find_compiler() -> list[str] | None:
@@ -75,7 +75,7 @@ def shared_library(
         sources = sorted(name for name in texts if name.endswith(".c"))
         out = Path(scratch) / "library"
         strip = ["-s"] if sys.platform.startswith("linux") else []
-        words = [*compiler, *_FLAGS, *strip, *[f"-D{d}" for d in defines], "-o", out.name]
+        words = [*compiler, *FLAGS, *strip, *[f"-D{d}" for d in defines], "-o", out.name]
         try:
             done = subprocess.run(
                 [*words, *sources, "-lm"], cwd=scratch, capture_output=True, text=True,

@@ -1,0 +1,191 @@
+"""The loop of a step over samples as machine code, where a C compiler is there and it pays.
+
+CasADi interprets the instructions of a step. A compiler makes the same of them in the same order,
+which gives the same numbers in a fifteenth of the time (15 ns against 250 ns for a step of the
+thesis's ship), but takes a few tenths of a second. So a step is compiled once so much of it was
+interpreted as takes as long, and what is compiled is kept in a folder of the user's for later runs.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import platform
+import stat
+import sys
+from collections.abc import Callable, Sequence
+from functools import cached_property, lru_cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from greybox.errors import GreyboxError
+from greybox.files import replacing
+from greybox.numerics.compiler import FLAGS, find_compiler, shared_library
+
+Array = NDArray[np.float64]
+# of the samples, and of pointers to arguments and to results
+Run = Callable[[int, Any, Any], None]
+_log = logging.getLogger(__name__)
+
+# instructions that take CasADi about 2 ms, as long as it takes to open what was compiled before,
+# and a quarter of a second, as long as the compiler takes
+_LOOK, _PAYS = 10**6, 3 * 10**7
+# libraries that are kept, some 16 kB each
+_MOST = 500
+# `step` and `along` are names of the C library or may be: these are nobody's
+_STEP, _LOOP = "greybox_step", "greybox_loop"
+
+
+def _loop_text(step: ca.Function, carried: int) -> str:
+    """Return C code of the loop, to stand behind that of the step."""
+    arguments, results = step.n_in(), step.n_out()
+    lines = [
+        f"void {_LOOP}(long long samples, const double* const* given, double* const* out) {{",
+        f"  const double* arg[{arguments}];",
+        f"  double* res[{results}];",
+        "  long long k;",
+        *(f"  arg[{i}] = given[{i}];" for i in range(arguments)),
+        *(f"  res[{i}] = out[{i}];" for i in range(results)),
+        "  for (k = 0; k < samples; k++) {",
+        f"    {_STEP}(arg, res, 0, 0, 0);",
+        *(f"    arg[{i}] = res[{i}];" for i in range(carried)),
+        f"    arg[{carried}] += {step.numel_in(carried)};",
+        *(f"    res[{i}] += {step.numel_out(i)};" for i in range(results)),
+        "  }",
+        "}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _source(step: ca.Function, loop: str) -> str:
+    """Return C code of a step, and of its loop."""
+    generator = ca.CodeGenerator("step", {"casadi_int": "int", "casadi_real": "double"})
+    given = [ca.SX.sym(step.name_in(i), step.sparsity_in(i)) for i in range(step.n_in())]
+    generator.add(ca.Function(_STEP, given, step.call(given)))
+    shown = '__attribute__((visibility("default")))\n'
+    return str(generator.dump()) + shown + loop
+
+
+def cache_folder() -> Path | None:
+    """Return the folder of the user's own in which libraries are kept, made where it is not there.
+
+    None where there is none, or others may write to it: what it holds is run.
+    """
+    if not hasattr(os, "getuid"):
+        return None
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(base) / "greybox"
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        about = folder.lstat()
+    except (OSError, RuntimeError):
+        return None
+    own = stat.S_ISDIR(about.st_mode) and about.st_uid == os.getuid()
+    return folder if own and stat.S_IMODE(about.st_mode) == 0o700 else None
+
+
+class Loop:
+    """A step taken along the samples of one run by machine code, once that pays.
+
+    Parameters
+    ----------
+    step : casadi.Function
+        SX. Arguments are what it hands to the next one, then a column that changes with the
+        step, then constants; results begin with what is handed on.
+    carried : int
+        How many arguments are handed on.
+    """
+
+    def __init__(self, step: ca.Function, carried: int) -> None:
+        self._step, self._carried = step, carried
+        self._taken = 0
+        self._opened = self._compiled = False
+        self._run: Run | None = None
+
+    def pays(self, samples: int) -> bool:
+        """Return whether the next `samples` steps are to be taken here, and count them."""
+        if self._run is None and not self._compiled:
+            self._taken += samples * self._step.n_instructions()
+            if self._taken >= _LOOK and not self._opened:
+                self._opened, self._run = True, self._found()
+            if self._taken >= _PAYS and self._run is None:
+                self._compiled, self._run = True, self._made()
+        return self._run is not None
+
+    @cached_property
+    def _text(self) -> str:
+        return _loop_text(self._step, self._carried)
+
+    @cached_property
+    def _place(self) -> Path | None:
+        """The file of the library, named by all that it follows from."""
+        folder = cache_folder()
+        if folder is None:
+            return None
+        all_of_it = (
+            self._step.serialize(), self._text, ca.CasadiMeta.version(), *FLAGS, sys.platform,
+            platform.machine(),
+        )  # fmt: skip
+        return folder / f"{sha256(repr(all_of_it).encode()).hexdigest()}.so"
+
+    def _found(self) -> Run | None:
+        """Return the function of a library that was compiled before."""
+        if self._place is None or not self._place.is_file():
+            return None
+        try:
+            os.utime(self._place)
+            run = ctypes.CDLL(str(self._place))[_LOOP]
+        except (OSError, AttributeError) as error:
+            _log.info("%s cannot be opened: %s", self._place, error)
+            return None
+        run.argtypes, run.restype = [ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p], None
+        return run
+
+    def _made(self) -> Run | None:
+        """Compile, keep, and return the function."""
+        if self._place is None:
+            return None
+        try:
+            compiler = find_compiler()
+            if compiler is None:
+                return None
+            library = shared_library(compiler, {"step.c": _source(self._step, self._text)}, ())
+            with replacing(self._place, "wb") as handle:
+                handle.write(library)
+            kept = sorted(self._place.parent.glob("*.so"), key=lambda p: p.stat().st_mtime)
+            for old in kept[:-_MOST]:
+                old.unlink(missing_ok=True)
+        except (GreyboxError, OSError) as error:
+            _log.info("a step is not compiled: %s", error)
+            return None
+        return self._found()
+
+    def __call__(self, samples: int, given: Sequence[Array], out: Sequence[Array]) -> None:
+        """Take steps; only after `pays` said so.
+
+        Parameters
+        ----------
+        samples : int
+        given : sequence of ndarray
+            Arguments of the first step, contiguous; what changes is (samples, ·).
+        out : sequence of ndarray
+            Filled with the results of each step, (samples, ·), contiguous.
+        """
+        assert self._run is not None
+        # a second thread may run while the library does, so pointers are those of this call
+        first, last = (
+            (ctypes.c_void_p * len(x))(*[a.ctypes.data for a in x]) for x in (given, out)
+        )
+        self._run(samples, first, last)
+
+
+@lru_cache(maxsize=128)
+def loop_of(step: ca.Function, carried: int) -> Loop:
+    """Return the loop of a step, the same one each time."""
+    return Loop(step, carried)
