@@ -87,7 +87,8 @@ def _given(options: argparse.Namespace) -> set[str]:
 
 def _purpose(options: argparse.Namespace, given: set[str]) -> Purpose:
     """Return what the trial is for, by --for or by options that ask for it themselves."""
-    asked = (p for p in PURPOSES.values() if given.intersection(p.asked_by))
+    # the more special one comes last
+    asked = (p for p in reversed([*PURPOSES.values()]) if given.intersection(p.asked_by))
     return PURPOSES[options.purpose] if options.purpose else next(asked, PURPOSES["prediction"])
 
 
@@ -846,8 +847,12 @@ def read_area(path: str | Path) -> Any:
 
 PURPOSES: Registry[Purpose] = Registry(
     "purpose",
-    # T-optimality
-    Purpose("between", "", _run_between, ("between",)),
+    Purpose(
+        "coefficients",
+        "the precision of coefficients in one regime",
+        _run_for_coefficients,
+        COEFFICIENTS,
+    ),
     Purpose(
         "prediction",
         "predictions to both sides over the operating envelope, allowing for what the structure "
@@ -856,10 +861,6 @@ PURPOSES: Registry[Purpose] = Registry(
         whole=True,
     ),
     Purpose("causes", "telling causes apart", _run_for_causes, ("causes", "diagnosis")),
-    Purpose(
-        "coefficients",
-        "the precision of coefficients in one regime",
-        _run_for_coefficients,
-        COEFFICIENTS,
-    ),
+    # T-optimality
+    Purpose("between", "", _run_between, ("between",)),
 )
