@@ -48,7 +48,7 @@ _STRAIGHT, _COURSE = 0.1, 0.25
 # speed at the start, as a share of the fastest straight motion
 _APPROACH = 1.0
 # slowest and fastest steady motion that counts, in what the prior's trial showed
-_SLOWEST, _FASTEST = 0.55, 1.3
+_SLOWEST, _FASTEST = 0.55, 1.1
 # what not even the potential terms say, as a share of the spread of each state
 _UNSAID = 0.05
 # share of the commands under which the prior must hold the ship
