@@ -7,7 +7,8 @@ or with none, and `greybox.diagnose` is asked without being told anything:
         [--seeds ...]
 
 A case stands in FILE (a JSON line) and is not made again. An effect counts where switching it off
-changes the squared held-out error of the model without causes by 1 % or more in some state. What a
+changes the squared held-out error of the model without causes by 1 % or more in some state, and
+what it moves the ship by is as large: a model fitted anew errs otherwise by chance. What a
 ship holds beyond (3.51) by itself is measured first, in the same way: each switch of its simulator
 is turned off, and those that count stand for the causes in `HOLDS`. A cause that stands and is
 neither planted nor held is wrong. The budget's share of the planted cause stands beside the share
@@ -217,11 +218,12 @@ def case(name: str, effect: str, seed: int, switches: Sequence[str]) -> dict[str
         if made is None:
             return None
         logs, planted = made
-        shares = np.zeros(3)
+        shares, moves = np.zeros(3), np.zeros(3, bool)
         if effect != "none":
             again = write(Path(place) / "clean", name, effect, seed, clean=True)
             assert again is not None
             shares = 1 - squares(again[0]) / squares(logs)
+            moves = _moves(name, effect, seed) >= COUNTS * squares(logs)
         begun = time.perf_counter()
         found = diagnose(logs[:-HELD_OUT], validate=logs[-HELD_OUT:]).to_dict()
     held = set().union(*(HOLDS.get(s, set()) for s in switches))
@@ -235,7 +237,7 @@ def case(name: str, effect: str, seed: int, switches: Sequence[str]) -> dict[str
     ]  # fmt: skip
     return {
         "ship": name, "effect": effect, "seed": seed, "share": float(shares.max()),
-        "counts": bool(shares.max() >= COUNTS),
+        "counts": bool((moves & (shares >= COUNTS)).any()),
         "budget": _budget(found["budget"], true, shares), "verdict": found["verdict"],
         "causes": ids, "groups": groups,
         "partial": [c["id"] for c in found["partial"]],
@@ -246,6 +248,20 @@ def case(name: str, effect: str, seed: int, switches: Sequence[str]) -> dict[str
         "estimate": _fits(logs),
         "seconds": time.perf_counter() - begun,
     }  # fmt: skip
+
+
+def _moves(name: str, effect: str, seed: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return the mean squared change of each held-out state by an effect; infinite where none is.
+
+    What is planted in sensors and commands moves no ship.
+    """
+    ways = (sail(name, effect, seed, clean) for clean in (False, True))
+    held = [made[1][-HELD_OUT:] for made in ways if made is not None]
+    moved = [
+        np.concatenate([a.true[s] - b.true[s] for a, b in zip(*held, strict=True)]) for s in "uvr"
+    ]
+    square = np.array([float((m**2).mean()) for m in moved])
+    return square if square.any() else np.full(3, np.inf)
 
 
 def _fits(logs: Sequence[TrialLog]) -> list[float]:
