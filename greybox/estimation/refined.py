@@ -375,7 +375,7 @@ def _refine(
     work: _Refinement, point: _Point, theta: Array, keep: Sequence[NDArray[np.bool_]]
 ) -> _Refined:
     """Find noise, coefficients and motions in turn until the coefficients settle."""
-    status, given = f"not converged after {_MOST} rounds", ""
+    status, given = f"had not converged after {_MOST} rounds", ""
     fit = work.first_levels(point, keep, theta)
     settling, settled, converged = False, False, False
     nearest: tuple[float, _Refined] | None = None

@@ -153,7 +153,9 @@ def iterate_instruments(
     strongest = (_strength(solutions), theta, instruments, solutions)
     if refine:
         most = _MAX_REFINEMENTS if refine is True else int(refine)
-        iteration = Iteration(most, f"not converged after {most} steps", False, "the refinement ")
+        iteration = Iteration(
+            most, f"had not converged after {most} steps", False, "the refinement "
+        )
         for count in range(1, most + 1):
             previous = _coefficients(solutions)
             target = _structure_theta(predictor, previous)
