@@ -15,7 +15,6 @@ from greybox.diagnosis.noise import Noise, fit_noise, free_run_noise
 from greybox.diagnosis.normal import bounded_step, inverse
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import CURRENTS, LogRun, Ship
-from greybox.model.disturbances import turn_bounds
 from greybox.numerics.lagged_moments import automatic_lags, bartlett_sums
 
 Array = NDArray[np.float64]
@@ -149,10 +148,6 @@ class Problem:
         """Return least and largest values of the free numbers of a point."""
         size = len(point.vector())
         low, high = np.full(size, -np.inf), np.full(size, np.inf)
-        for name, (least, most) in turn_bounds(self.sample_time).items():
-            for k, i in enumerate(point.places):
-                if self.names[i] == name:
-                    low[k], high[k] = least, most
         if self.metric == "free run":
             # chosen damping takes energy out, as its choice had it
             terms = self.structure.terms

@@ -14,7 +14,6 @@ from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import context_of, prepare
 from greybox.diagnosis.result import Found, Quantity
 from greybox.diagnosis.search import freed
-from greybox.model.disturbances import turn_bounds
 from greybox.model.terms import parse_term
 from greybox.study.blind import draw
 
@@ -34,11 +33,8 @@ def test_coefficients_and_currents_of_a_cause_have_its_bounds(ready) -> None:
     where = problem.numbers_of(point, hypothesis)[: len(hypothesis.parameters)]
     np.testing.assert_array_equal(low[where], [p.low for p in hypothesis.parameters])
     np.testing.assert_array_equal(high[where], [p.high for p in hypothesis.parameters])
-    turn = turn_bounds(problem.sample_time)
-    there = [point.places.index(problem.place(name)) for name in turn]
-    np.testing.assert_array_equal(np.transpose([low[there], high[there]]), [*turn.values()])
     # all else is free
-    others = np.setdiff1d(np.arange(len(low)), [*where, *there])
+    others = np.setdiff1d(np.arange(len(low)), where)
     assert np.isinf(low[others]).all()
     assert np.isinf(high[others]).all()
 
