@@ -679,8 +679,7 @@ def _slow_tests(slow: Mapping[str, tuple[float, float]]) -> tuple[TestResult, ..
     for name, (z, p) in slow.items():
         found = (
             "wanders more than a fit to white noise would: something that the model lacks moves "
-            "the "
-            "ship; the standard errors allow for it, and --process-noise estimates with it."
+            "the ship; the standard errors allow for it, and --process-noise estimates with it."
             if p <= _WANDERS
             else "shows no slow part beyond noise."
         )

@@ -547,8 +547,7 @@ def build_predictor(
                 raise StructureError(
                     f"the regressor of {term.name} is zero where the water rests, so a regression "
                     f"cannot find its coefficient: fit free runs in a current (--method oe "
-                    f"--predictor augmented), or leave it out "
-                    f"(--structure '{structure.name}-{term.name}')."
+                    f"--predictor augmented), or leave it out of --structure."
                 )
             if term.factors and not span.add_if_new(own[t]):
                 kept = ", ".join(

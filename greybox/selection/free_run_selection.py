@@ -145,7 +145,6 @@ class FreeRunSelection:
         self.names = self.model.parameters
         self._used = self._whole.use.ravel() > 0
         self._samples = float(self._used.sum())
-        # damping takes energy out
         self._least, self._most = (np.full(len(self.names), b) for b in (-np.inf, np.inf))
         for name, bounds in turn_bounds(step).items():
             if name in self.names:
@@ -154,6 +153,7 @@ class FreeRunSelection:
         for i in self.model.predictor.parameter_columns:
             terms = [family.terms[family.index(t)] for t in self.model.columns[i].terms]
             if all(t.dissipates for t in terms):
+                # damping takes energy out
                 self._most[i] = 0.0
 
     def path(
