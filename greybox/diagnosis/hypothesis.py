@@ -88,6 +88,9 @@ class Hypothesis:
     arguments : tuple of str
         Columns of commands that its force is a function of at the same moment, where it has an
         `apply` and is one.
+    parity : {0, 1, -1}
+        Whether the force of a hypothesis with `arguments` keeps the ship's symmetry of port and
+        starboard where its thruster does (1), breaks it (-1), or has parts of both (0).
     refit_from_scratch : bool
         Whether the coefficients must be sought anew: what it changes is too much for
         derivatives.
@@ -110,6 +113,7 @@ class Hypothesis:
     variants: tuple[Hypothesis, ...] = ()
     co_freed: tuple[str, ...] = ()
     arguments: tuple[str, ...] = ()
+    parity: int = 0
     refit_from_scratch: bool = False
     place: str = ""
     only: bool = False

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.evidence.held_out import HeldOut, Proof, proof_of
 from greybox.diagnosis.evidence.omnibus import omnibus
-from greybox.diagnosis.evidence.remainder import contributions_beside, motion_and_commands
+from greybox.diagnosis.evidence.remainder import MOTION_AND_COMMANDS, contributions_beside
 from greybox.diagnosis.evidence.standing import Standing, level_of, standing
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
@@ -263,7 +263,7 @@ def _left_to_motion(case: DiagnosisProblem, fit: Fit) -> bool:
     """Whether a force of motion and commands would explain more than a deviation to be told."""
     pairs = case.held_out(fit.integrator).pairs(fit)
     numbers = sum(nu.size for pair in pairs for nu in pair.held_fit.nu)
-    left = omnibus(pairs, motion_and_commands)
+    left = omnibus(pairs, MOTION_AND_COMMANDS)
     return left.proof.p_value < SURE and left.gain > WORTH * numbers
 
 

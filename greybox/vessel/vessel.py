@@ -134,6 +134,11 @@ class Thruster:
                 )
 
     @property
+    def steered_by(self) -> str | None:
+        """Log column that turns this thruster or its rudder; None where nothing does."""
+        return self.angle if isinstance(self.angle, str) else self.rudder
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Log columns that move this thruster."""
         return tuple(column for _, column, _, _ in self.movements)

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from greybox.diagnosis.evidence.held_out import Proof
 from greybox.diagnosis.evidence.remainder import (
-    anything,
+    ANYTHING,
+    MOTION_AND_COMMANDS,
+    _Pushers,
     features,
     generic_force,
-    motion_and_commands,
 )
 from greybox.diagnosis.evidence.standing import Standing, _own_arguments, standing
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.search import FIRST, Search, weighed
 from greybox.study.blind import draw
+from greybox.vessel.vessel import Thruster, Vessel
 
 
 def proof(gain: float, p: float) -> Proof:
@@ -74,13 +78,74 @@ def test_features_are_functions_of_what_they_say(sailed) -> None:
     assert np.abs(made.values[:, of_u] - through[:, None]).max(axis=0).min() < 1e-12
 
 
+def test_in_the_mirror_of_port_and_starboard_each_feature_becomes_its_image() -> None:
+    rng = np.random.default_rng(4)
+    n = 40
+    vessel = Vessel(
+        "Twin", 20.0,
+        (
+            Thruster("propeller_rudder", -9.0, -2.0, "n_port", rudder="delta_port"),
+            Thruster("propeller_rudder", -9.0, 2.0, "n_starboard", rudder="delta_starboard"),
+            Thruster("azimuth", 8.0, 0.0, "n_bow", "alpha"),
+            Thruster("tunnel", 6.0, 0.0, "n_tunnel"),
+            Thruster("fixed", -5.0, 3.0, "n_alone"),
+        ),
+    )  # fmt: skip
+    of = {c: rng.normal(size=n) for c in vessel.commands}
+    mirrored = {
+        "n_port": of["n_starboard"], "n_starboard": of["n_port"],
+        "delta_port": -of["delta_starboard"], "delta_starboard": -of["delta_port"],
+        "n_bow": of["n_bow"], "alpha": -of["alpha"], "n_tunnel": -of["n_tunnel"],
+        "n_alone": of["n_alone"],
+    }  # fmt: skip
+    assert mirrored.keys() == of.keys()
+    x, tau, way = rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), np.array([1.0, -1.0, -1.0])
+    ship = SimpleNamespace(vessel=vessel, wires=(), current=np.zeros(2))
+    fit = SimpleNamespace(point=SimpleNamespace(ship=ship))
+
+    class Log(dict):
+        pass
+
+    def made(commands, sign):
+        log = Log(commands)
+        log.vessel = vessel
+        run = SimpleNamespace(
+            states=("u", "v", "r"), log=log, run=lambda *_: SimpleNamespace(x=x * sign),
+            forces=lambda *_: tau * sign, sample_time=0.5, time=np.arange(n),
+            structure=SimpleNamespace(inputs=("taux", "tauy", "taun")),
+        )  # fmt: skip
+        return features(run, fit, x[0], np.full((3, 1), 0.5))
+
+    one, other = made(of, np.ones(3)), made(mirrored, way)
+    has = one.signs != 0
+    assert np.allclose(other.values[:, has], (one.signs * one.values[:, one.images])[:, has])
+    # what has no image: the heading, and a thruster with none on the other side
+    alone = [bool(a & {"heading", "n_alone"}) and not a & {"u", "v", "r"} for a in one.arguments]
+    assert (has == ~np.array(alone)).all()
+    assert sorted(one.images) == list(range(len(one.images)))
+
+
+def test_prior_of_forces_that_keep_and_that_break_the_symmetry() -> None:
+    # the second and third are images of each other, the last has none
+    pushers = _Pushers(np.ones(1), np.array([1.0, -1.0, -1.0, 0.0]), np.array([0, 2, 1, 3]))
+    reflection = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, -1, 0, 0], [0, 0, 0, 0]])
+    kept, broken = 0.7, 0.2
+    root = pushers.deviations(kept, broken)
+    own = (kept**2 + broken**2) / 2 * np.eye(4)
+    expected = own + (kept**2 - broken**2) / 2 * reflection
+    assert np.allclose(root @ root.T, expected, atol=1e-15)
+    # alone, each keeps to its own
+    assert np.allclose(pushers.deviations(1.0, 0.0)[0, 0], 1.0)
+    assert np.allclose(pushers.deviations(0.0, 1.0)[0], 0.0)
+
+
 def test_heading_time_and_past_commands_are_no_part_of_the_rival(sailed) -> None:
     _, _, problem, _, fit = sailed
     made = features(problem.runs[0], fit, fit.point.starts[0], np.zeros((3, 0)))
-    kept = [a for a in made.arguments if motion_and_commands("u", a)]
+    kept = [a for a in made.arguments if MOTION_AND_COMMANDS.takes("u", a)]
     commands = set(problem.runs[0].log.vessel.commands)
     assert set.union(*map(set, kept)) <= {"u", "v", "r"} | commands
-    assert len(kept) < sum(anything("u", a) for a in made.arguments)
+    assert len(kept) < sum(ANYTHING.takes("u", a) for a in made.arguments)
 
 
 def test_a_current_stands_because_no_force_of_motion_knows_the_heading(sailed) -> None:
@@ -136,9 +201,14 @@ def test_own_arguments_are_those_of_the_terms_factors(sailed) -> None:
     hypotheses = {a.key: a for a in ready.hypotheses}
     use = _own_arguments(problem, hypotheses["cubic_damping:X_uuu"])
     assert use is not None
-    assert use("u", frozenset({"u"}))
-    assert not use("u", frozenset({"u", "v"}))
-    assert not use("r", frozenset({"u"}))
+    assert use.takes("u", frozenset({"u"}))
+    assert not use.takes("u", frozenset({"u", "v"}))
+    assert not use.takes("r", frozenset({"u"}))
+    # a damping of surge keeps the symmetry of port and starboard, a constant side force breaks it
+    assert use.parity == 1
+    assert _own_arguments(problem, hypotheses["cubic_damping:Y_vvv"]).parity == 1
+    assert _own_arguments(problem, hypotheses["side_force:Y_0"]).parity == -1
+    assert _own_arguments(problem, hypotheses["angle_offset:alpha1:0"]).parity == -1
     assert _own_arguments(problem, hypotheses["current"]) is None
     assert _own_arguments(problem, hypotheses["thruster_lag:force"]) is None
 

@@ -82,14 +82,9 @@ def _speeds(context: Context, group: Sequence[int]) -> str:
     return "+".join(dict.fromkeys(context.vessel.thrusters[i].speed for i in group))
 
 
-def _steered_by(thruster: Thruster) -> str | None:
-    """Return the column that turns a thruster or its rudder."""
-    return thruster.angle if isinstance(thruster.angle, str) else thruster.rudder
-
-
 def _driven_by(thruster: Thruster) -> tuple[str, ...]:
     """Return the columns that a thruster's force is a function of."""
-    angle = _steered_by(thruster)
+    angle = thruster.steered_by
     return (thruster.speed,) if angle is None else (thruster.speed, angle)
 
 
@@ -120,13 +115,14 @@ class ThrusterGain(Cause):
             parameter = Parameter(f"gain_{thrusters[members[0]].speed}", "1", 0.85, 0.0, most, 1.0)
             driven = dict.fromkeys(c for i in members for c in _driven_by(thrusters[i]))
             return Hypothesis(
-                self.id, f"{self.id}:{key}", (parameter,), (), apply, arguments=tuple(driven)
-            )
+                self.id, f"{self.id}:{key}", (parameter,), (), apply, arguments=tuple(driven),
+                parity=1,
+            )  # fmt: skip
 
         out = []
         for i, t in enumerate(thrusters):
             most = _STRONGEST if [i] in groups and len(groups) > 1 else 1.0
-            out.append(gain([i], f"{t.speed}:{_steered_by(t) or i}", most))
+            out.append(gain([i], f"{t.speed}:{t.steered_by or i}", most))
         several = [g for g in groups if len(g) > 1]
         if len(groups) < 3:
             # of two groups the strength of one says that of the other
@@ -364,7 +360,7 @@ class QuadraticThrust(Cause):
             driven = dict.fromkeys(c for i in members for c in _driven_by(thrusters[i]))
             return Hypothesis(
                 self.id, f"{self.id}:{place}" if place else self.id, (parameter,), (), apply,
-                arguments=tuple(driven), place=place,
+                arguments=tuple(driven), place=place, parity=1,
             )  # fmt: skip
 
         groups = [g for all_ in _groups(context) if (g := [i for i in all_ if i in linear])]
@@ -399,7 +395,7 @@ class AngleOffset(Cause):
         """Return one a steered thruster."""
         out = []
         for i, thruster in enumerate(context.vessel.thrusters):
-            column = _steered_by(thruster)
+            column = thruster.steered_by
             if column is None:
                 continue
 
@@ -410,8 +406,11 @@ class AngleOffset(Cause):
             parameter = Parameter(f"offset_{column}", "rad", 0.0, -0.8, 0.8)
             key = f"{self.id}:{column}:{i}"
             out.append(
-                Hypothesis(self.id, key, (parameter,), (), apply, arguments=_driven_by(thruster))
-            )
+                Hypothesis(
+                    self.id, key, (parameter,), (), apply, arguments=_driven_by(thruster),
+                    parity=-1,
+                )
+            )  # fmt: skip
         return out
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:

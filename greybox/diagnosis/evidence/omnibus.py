@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.evidence.held_out import Pair, Proof, proof_of
-from greybox.diagnosis.evidence.remainder import Use, anything, generic_force
+from greybox.diagnosis.evidence.remainder import ANYTHING, Use, generic_force
 from greybox.numerics.linalg import scaled_inverse
 
 Array = NDArray[np.float64]
@@ -38,14 +38,14 @@ class Omnibus:
     explicable: float
 
 
-def omnibus(pairs: Sequence[Pair], use: Use = anything) -> Omnibus:
+def omnibus(pairs: Sequence[Pair], use: Use = ANYTHING) -> Omnibus:
     """Fit a generic force to a model's errors, and test it on other logs.
 
     Parameters
     ----------
     pairs : sequence of Pair
         The hypothesis on the estimation and the held-out logs.
-    use : callable
+    use : Use
         What forces there may be.
     """
     along, size, total = [], 0.0, 0.0

@@ -1,8 +1,9 @@
 """A generic force beside the structure: smooth functions that push each equation.
 
 Ridge regression fits them to the innovations of the estimation logs, their strength by
-marginal likelihood; what it then predicts on held-out logs is a fault of the model and not
-the sea's own noise. Of motion through the water and of present commands it is the rival of
+marginal likelihood: one of forces that keep the ship's symmetry of port and starboard, and one of
+those that break it, which hulls hardly do. What it then predicts on held-out logs is a fault of
+the model and not the sea's own noise. Of motion through the water and of present commands it is the rival of
 every cause: what it explains as well has no name yet. Heading, time and past commands are for
 the test whether anything is left at all.
 
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from math import cos
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,13 +29,16 @@ from greybox.diagnosis.ship import LogRun, shifted, wired
 from greybox.numerics.lagged_moments import correlation_factor
 from greybox.numerics.linalg import tall_svd
 from greybox.rotation import ned_to_body
+from greybox.vessel.vessel import Thruster, Vessel
 
 Array = NDArray[np.float64]
 # of a state and the signals that a feature is a function of: whether it takes part
-Use = Callable[[str, frozenset[str]], bool]
+Takes = Callable[[str, frozenset[str]], bool]
 
 # prior deviations of a direction's share, in innovations' deviations, that are tried
 _STRENGTHS = np.geomspace(0.05, 100.0, 24)
+# those of forces that break the symmetry of port and starboard, as a share of those that keep it
+_BROKEN = (0.01, 0.1, 0.3, 1.0, 3.0)
 # seconds by which past commands are late
 _LAGS = (2.0, 5.0, 10.0)
 # quantiles of a state's size from which on a force may begin
@@ -41,6 +46,8 @@ _KNOTS = (0.3, 0.6, 0.85)
 # singular values of the nuisance, and squares of the force's, as a share of the largest, below
 # which a direction is not known
 _UNKNOWN = 1e-8
+# cosine of an angle that counts as sideways, and functions of a thruster's own commands
+_SIDEWAYS, _A_THRUSTER = 1e-9, 7
 # what no smooth force of motion and present commands is a function of
 HEADING, TIME, PAST = "heading", "time", "past commands"
 _OTHERS = frozenset({HEADING, TIME, PAST})
@@ -57,20 +64,38 @@ class Features:
     arguments : tuple of frozenset of str
         (G,) signals that each is a function of: states, columns of commands, and `HEADING`,
         `TIME`, `PAST`.
+    signs, images : ndarray
+        (G,) in the mirror each becomes the one at its index here, times its sign; the sign is 0
+        where it has no image.
     """
 
     values: Array
     arguments: tuple[frozenset[str], ...]
+    signs: Array
+    images: NDArray[np.intp]
 
 
-def anything(state: str, arguments: frozenset[str]) -> bool:
-    """Take every feature in every equation."""
-    return True
+@dataclass(frozen=True)
+class Use:
+    """Which features push which equation.
+
+    Parameters
+    ----------
+    takes : callable
+        Of a state and a feature's arguments: whether it takes part.
+    parity : {0, 1, -1}
+        Forces that keep the symmetry of port and starboard alone (1), those that break it alone
+        (-1), or both (0).
+    """
+
+    takes: Takes
+    parity: int = 0
 
 
-def motion_and_commands(state: str, arguments: frozenset[str]) -> bool:
-    """Take functions of motion through the water and of present commands."""
-    return not arguments & _OTHERS
+# every feature in every equation
+ANYTHING = Use(lambda state, arguments: True)
+# functions of motion through the water and of present commands
+MOTION_AND_COMMANDS = Use(lambda state, arguments: not arguments & _OTHERS)
 
 
 def knots_of(problem: Problem) -> Array:
@@ -101,51 +126,89 @@ def features(run: LogRun, fit: Fit, start: Array, knots: Array) -> Features:
     log = run.log
     columns: list[Array] = []
     arguments: list[frozenset[str]] = []
+    signs: list[int] = []
+    images: dict[int, int] = {}
 
-    def add(value: Array, *of: str) -> None:
+    def add(value: Array, sign: int, *of: str) -> None:
         columns.append(value)
+        signs.append(sign)
         arguments.append(frozenset(of))
 
     names = run.states
-    add(np.ones(len(x)))
+    add(np.ones(len(x)), 1)
     states = list(x.T)
+    own_signs = [parity(name) for name in names]
     for i, one in enumerate(states):
-        add(one, names[i])
+        add(one, own_signs[i], names[i])
         for j, two in enumerate(states[i:], i):
-            add(one * two, names[i], names[j])
-            add(np.abs(one) * two, names[i], names[j])
+            add(one * two, own_signs[i] * own_signs[j], names[i], names[j])
+            add(np.abs(one) * two, own_signs[j], names[i], names[j])
             if two is not one:
-                add(one * np.abs(two), names[i], names[j])
-        add(one**3, names[i])
+                add(one * np.abs(two), own_signs[i], names[i], names[j])
+        add(one**3, own_signs[i], names[i])
         for knot in knots[i]:
             beyond = np.maximum(np.abs(one) - knot, 0.0)
-            add(beyond, names[i])
-            add(beyond * np.sign(one), names[i])
+            add(beyond, 1, names[i])
+            add(beyond * np.sign(one), own_signs[i], names[i])
     commands = wired({c: log[c] for c in log.vessel.commands}, ship.wires)
-    for thruster in log.vessel.thrusters:
+    first = []
+    for thruster, image in zip(log.vessel.thrusters, _images(log.vessel), strict=True):
+        first.append(len(columns))
         n = commands[thruster.speed]
-        angle = thruster.angle if isinstance(thruster.angle, str) else thruster.rudder
+        angle = thruster.steered_by
         turned = commands[angle] if angle is not None else np.zeros(len(x))
         own = (thruster.speed,) if angle is None else (thruster.speed, angle)
-        for push in (np.ones(len(x)), n, n * np.abs(n)):
-            add(push * np.cos(turned), *own)
-            add(push * np.sin(turned), *own)
-        add(np.sign(n), thruster.speed)
-    for force in tau.T:
+        # in the mirror a tunnel's propeller turns the other way
+        turns, there = (-1 if _across(thruster) else 1), int(image is not None)
+        for push, sign in ((np.ones(len(x)), 1), (n, turns), (n * np.abs(n), turns)):
+            add(push * np.cos(turned), there * sign, *own)
+            add(push * np.sin(turned), -there * sign, *own)
+        add(np.sign(n), there * turns, thruster.speed)
+    for mine, image in zip(first, _images(log.vessel), strict=True):
+        if image is not None:
+            images |= {mine + k: first[image] + k for k in range(_A_THRUSTER)}
+    forces = [parity(name) for name in run.structure.inputs]
+    for force, sign in zip(tau.T, forces, strict=True):
         for name, state in zip(names, states, strict=True):
-            add(force * state, name, *commands)
+            add(force * state, sign * parity(name), name, *commands)
         for lag in _LAGS:
-            add(shifted(force, lag / run.sample_time), PAST)
+            add(shifted(force, lag / run.sample_time), sign, PAST)
     psi = log["psi"] if "psi" in log else np.zeros(len(x))
     for k in (1, 2):
-        add(np.cos(k * psi), HEADING)
-        add(np.sin(k * psi), HEADING)
-    add(states[0] * np.cos(psi), HEADING)
-    add(states[0] * np.sin(psi), HEADING)
+        add(np.cos(k * psi), 0, HEADING)
+        add(np.sin(k * psi), 0, HEADING)
+    add(states[0] * np.cos(psi), 0, HEADING)
+    add(states[0] * np.sin(psi), 0, HEADING)
     later = run.time > run.time[-1] / 2
-    for column in (*states, *tau.T):
-        add(later * column, TIME)
-    return Features(np.column_stack(columns), tuple(arguments))
+    for column, sign in zip((*states, *tau.T), (*own_signs, *forces), strict=True):
+        add(later * column, sign, TIME)
+    return Features(
+        np.column_stack(columns), tuple(arguments), np.array(signs, float),
+        np.array([images.get(k, k) for k in range(len(columns))]),
+    )  # fmt: skip
+
+
+def parity(signal: str) -> int:
+    """Return the sign that a motion or force has in the mirror of port and starboard."""
+    return 1 if signal in ("u", "taux") else -1
+
+
+def _across(thruster: Thruster) -> bool:
+    """Return whether a thruster that cannot be steered pushes sideways."""
+    if thruster.type == "tunnel":
+        return True
+    return isinstance(thruster.angle, float) and abs(cos(thruster.angle)) < _SIDEWAYS
+
+
+def _images(vessel: Vessel) -> list[int | None]:
+    """Return the index of each thruster's image in the mirror: its own on the centreline."""
+
+    def place(t: Thruster) -> tuple[str, float, float]:
+        return t.type, round(t.x, 6), round(t.y, 6) + 0.0
+
+    known = {place(t): i for i, t in enumerate(vessel.thrusters)}
+    mirrored = [(t.type, round(t.x, 6), round(-t.y, 6) + 0.0) for t in vessel.thrusters]
+    return [known.get(place) for place in mirrored]
 
 
 @dataclass(frozen=True)
@@ -170,15 +233,14 @@ class GenericForce:
     moved: Array
 
 
-def generic_force(pair: Pair, use: Use = motion_and_commands) -> GenericForce:
+def generic_force(pair: Pair, use: Use = MOTION_AND_COMMANDS) -> GenericForce:
     """Fit a generic force to what a hypothesis leaves, and run it on the held-out logs.
 
     Parameters
     ----------
     pair : Pair
         Whose runs stay bounded; computed once for each use.
-    use : callable
-        Which features push which equation.
+    use : Use
     """
     if use not in pair.known:
         pair.known[use] = _generic_force(pair, use)
@@ -200,22 +262,24 @@ def _generic_force(pair: Pair, use: Use) -> GenericForce:
         return none
     left, values, right = tall_svd(nuisance / scale, _UNKNOWN)
     knots = knots_of(problem)
-    pushed, scales = _pushed(problem, fit, knots, use, None)
+    pushed, pushers = _pushed(problem, fit, knots, use, None)
     raw = _stacked([fit.noise.whiten(c) for c in pushed])
     with np.errstate(over="ignore"):
         size = np.sqrt((raw**2).sum(axis=0))
     if not np.isfinite(size).all():
         return none
     size[size == 0] = 1.0
+    size = np.sqrt((size**2 + size[pushers.images] ** 2) / 2)
     raw /= size
     along = left.T @ raw
     nu = np.concatenate([n.ravel() for n in fit.nu])
     # of errors with a memory fewer tell anything new
     alike = np.sqrt(correlation_factor(np.concatenate(fit.nu)))
-    delta = _ridge((raw - left @ along) / alike, (nu - left @ (left.T @ nu)) / alike)
+    rows, left_over = (raw - left @ along) / alike, (nu - left @ (left.T @ nu)) / alike
+    delta = _likeliest(rows, left_over, pushers, use.parity)
     # what the coefficients give back, where they can imitate
     back = (-((right.T / values) @ (along @ delta)) / scale)[:free]
-    moved, _ = _pushed(held, held_fit, knots, use, scales)
+    moved, _ = _pushed(held, held_fit, knots, use, pushers.scales)
     point = replace(fit.point, starts=held_fit.point.starts)
     shown = held.slopes(point)
     parts = [
@@ -236,7 +300,7 @@ def _generic_force(pair: Pair, use: Use) -> GenericForce:
     return GenericForce(whitened - starts @ taken, seen, errors, back)
 
 
-def contributions_beside(pair: Pair, use: Use = motion_and_commands) -> Array:
+def contributions_beside(pair: Pair, use: Use = MOTION_AND_COMMANDS) -> Array:
     """Return what each held-out sample adds to −2 log L with a generic force beside, (N,)."""
     held, held_fit = pair.held, pair.held_fit
     errors = generic_force(pair, use).errors
@@ -245,19 +309,54 @@ def contributions_beside(pair: Pair, use: Use = motion_and_commands) -> Array:
     return np.concatenate(held.added(nu, noise))
 
 
+@dataclass(frozen=True)
+class _Pushers:
+    """What pushes: features in equations, m of them.
+
+    Parameters
+    ----------
+    scales : ndarray
+        (G,) sizes of the features.
+    signs, images : ndarray
+        (m,) in the mirror each column becomes the one at its index here, times its sign; the sign
+        is 0 where it has no image.
+    """
+
+    scales: Array
+    signs: Array
+    images: NDArray[np.intp]
+
+    def deviations(self, kept: float, broken: float) -> Array:
+        """Return a square root (m, m) of a prior covariance.
+
+        Parameters
+        ----------
+        kept, broken : float
+            Prior deviations of forces that keep the symmetry of port and starboard, and of those
+            that break it.
+        """
+        paired = self.signs != 0
+        alone = np.sqrt((kept**2 + broken**2) / 2)
+        root = np.diag(np.where(paired, (kept + broken) / 2, alone))
+        where = np.flatnonzero(paired)
+        root[where, self.images[where]] += self.signs[where] * (kept - broken) / 2
+        return root
+
+
 def _pushed(
     problem: Problem, fit: Fit, knots: Array, use: Use, scales: Array | None
-) -> tuple[list[Array], Array]:
-    """Return ∂y of every feature in every equation that it pushes, and the features' sizes."""
+) -> tuple[list[Array], _Pushers]:
+    """Return ∂y of every feature in every equation that it pushes, and which they are."""
     point = fit.point
     ship = point.ship
     made = [features(r, fit, s, knots) for r, s in zip(problem.runs, point.starts, strict=True)]
     if scales is None:
         scales = np.sqrt(np.mean(np.concatenate([m.values**2 for m in made]), axis=0))
         scales = np.where(scales > 0, scales, 1.0)
+    states = problem.structure.states
     wanted = [
-        [k for k, arguments in enumerate(made[0].arguments) if use(state, arguments)]
-        for state in problem.structure.states
+        [k for k, arguments in enumerate(made[0].arguments) if use.takes(state, arguments)]
+        for state in states
     ]
     out = []
     for run, start, g in zip(problem.runs, point.starts, made, strict=True):
@@ -271,25 +370,47 @@ def _pushed(
             first += len(mine)
         slope = sensitivities(replace(linear, driven=driven))
         out.append(run.seen(ship, slope)[:, :, : driven.shape[2]])
-    return out, scales
+    columns = [(i, k) for i, mine in enumerate(wanted) for k in mine]
+    place = {column: at for at, column in enumerate(columns)}
+    images = [place.get((i, int(made[0].images[k])), -1) for i, k in columns]
+    signs = [
+        parity(states[i]) * made[0].signs[k] if image >= 0 else 0.0
+        for (i, k), image in zip(columns, images, strict=True)
+    ]
+    images = [at if image < 0 else image for at, image in enumerate(images)]
+    return out, _Pushers(scales, np.array(signs), np.array(images, np.intp))
 
 
 def _stacked(parts: Sequence[Array]) -> Array:
     return np.concatenate([p.reshape(-1, p.shape[2]) for p in parts])
 
 
-def _ridge(rows: Array, nu: Array) -> Array:
-    """Return coefficients (m,) by the strength that makes the innovations likeliest."""
-    squares, vectors = np.linalg.eigh(rows.T @ rows)
+def _likeliest(rows: Array, nu: Array, pushers: _Pushers, parity: int) -> Array:
+    """Return coefficients (m,) by the strengths that make the innovations likeliest."""
+    if parity:
+        tried = [pushers.deviations(float(parity > 0), float(parity < 0))]
+    else:
+        tried = [pushers.deviations(1.0, broken) for broken in _BROKEN]
+    square, along = rows.T @ rows, rows.T @ nu
+    found = [(_ridge(root.T @ square @ root, root.T @ along), root) for root in tried]
+    (_, best), root = min(found, key=lambda f: f[0][0])
+    return np.asarray(root @ best)
+
+
+def _ridge(square: Array, along: Array) -> tuple[float, Array]:
+    """Return −2 log of the marginal likelihood, constants apart, and coefficients (m,).
+
+    Parameters
+    ----------
+    square, along : ndarray
+        (m, m), (m,) products of the rows, and of the rows with the innovations.
+    """
+    squares, vectors = np.linalg.eigh(square)
     known = squares > _UNKNOWN * squares[-1]
     values, right = np.sqrt(squares[known]), vectors[:, known].T
-    share = right @ (rows.T @ nu) / values
-    best, chosen = np.inf, _STRENGTHS[0]
-    for strength in _STRENGTHS:
-        grown = 1 + (strength * values) ** 2
-        # −2 log of the marginal likelihood, constants apart
-        cost = float((share**2 / grown).sum() + np.log(grown).sum())
-        if cost < best:
-            best, chosen = cost, strength
-    shrunk = chosen**2 * values / (1 + (chosen * values) ** 2)
-    return np.asarray(right.T @ (shrunk * share))
+    share = right @ along / values
+    grown = 1 + (_STRENGTHS[:, None] * values) ** 2
+    costs = (share**2 / grown + np.log(grown)).sum(axis=1)
+    best = int(np.argmin(costs))
+    shrunk = _STRENGTHS[best] ** 2 * values / grown[best]
+    return float(costs[best]), right.T @ (shrunk * share)

@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.evidence.held_out import Pair, Proof, proof_of
-from greybox.diagnosis.evidence.remainder import Use, contributions_beside, generic_force
+from greybox.diagnosis.evidence.remainder import (
+    Use,
+    contributions_beside,
+    generic_force,
+    parity,
+)
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit, Point
@@ -175,21 +180,27 @@ def _scatter(pair: Pair, hypothesis: Hypothesis) -> Array:
 
 
 def _own_arguments(problem: Problem, hypothesis: Hypothesis) -> Use | None:
-    """Return which generic forces are functions of a hypothesis's arguments; None where none is."""
+    """Return generic forces of a hypothesis's arguments and symmetry; None where there are none."""
     if hypothesis.apply is not None:
         if not hypothesis.arguments:
             return None
         columns = frozenset(hypothesis.arguments)
-        return lambda state, arguments: bool(arguments) and arguments <= columns
+        return Use(
+            lambda state, arguments: bool(arguments) and arguments <= columns, hypothesis.parity
+        )
     if set(hypothesis.columns) & {*CURRENTS}:
         return None
     commands = frozenset(problem.runs[0].log.vessel.commands)
     known = {*problem.structure.states}
     own: dict[str, frozenset[str]] = {}
+    signs = set()
     for name in hypothesis.columns:
         term = parse_term(name)
         signals: set[str] = set()
+        sign = parity(term.state)
         for factor in term.factors:
+            # a bump on one side only has parts of both
+            sign *= 0 if factor.bump else 1 if factor.modulus else parity(factor.signal)
             if factor.signal in known:
                 signals.add(factor.signal)
             elif factor.signal in problem.structure.inputs:
@@ -197,4 +208,8 @@ def _own_arguments(problem: Problem, hypothesis: Hypothesis) -> Use | None:
             else:
                 return None
         own[term.state] = own.get(term.state, frozenset()) | signals
-    return lambda state, arguments: state in own and arguments <= own[state]
+        signs.add(sign)
+    return Use(
+        lambda state, arguments: state in own and arguments <= own[state],
+        signs.pop() if len(signs) == 1 else 0,
+    )
