@@ -3,9 +3,9 @@
 Ridge regression fits them to the innovations of the estimation logs, their strength by
 marginal likelihood: one of forces that keep the ship's symmetry of port and starboard, and one of
 those that break it, which hulls hardly do. What it then predicts on held-out logs is a fault of
-the model and not the sea's own noise. Of motion through the water and of present commands it is the rival of
-every cause: what it explains as well has no name yet. Heading, time and past commands are for
-the test whether anything is left at all.
+the model and not the sea's own noise. Of motion through the water and of present commands it is
+the rival of every cause: what it explains as well has no name yet. Heading, time and past
+commands are for the test whether anything is left at all.
 
 References
 ----------
