@@ -17,8 +17,7 @@ from greybox.commands.common import (
 if TYPE_CHECKING:
     from greybox.report.page import Page
 
-HELP = "estimate many ships of one class: what they share, which ship differs, what changes over "
-"time"
+HELP = "estimate many ships of a class: what they share, which ship differs, what changes over time"
 EXAMPLES = """examples:
   greybox fleet ferries --out ferries.csv --report ferries.html
   greybox fleet ferries --json ferries.json --cluster tcp://host:8786
