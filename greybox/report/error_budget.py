@@ -64,8 +64,9 @@ def budget_table(budget: Sequence[BudgetPart]) -> Table:
         for p in budget
     ]
     head = ["part", *(LABELS.get(s, s).split(" [")[0] for s in states)]
-    caption = "Sources of the squared held-out error before the model is extended [%] (95 % "
-    "interval)"
+    caption = (
+        "Sources of the squared held-out error before the model is extended [%] (95 % interval)"
+    )
     return Table(caption, head, rows)
 
 
