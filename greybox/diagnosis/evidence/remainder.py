@@ -180,13 +180,27 @@ def generic_force(pair: Pair, use: Use = motion_and_commands) -> GenericForce:
     use : callable
         Which features push which equation.
     """
-    if use not in pair.known:
-        pair.known[use] = _generic_force(pair, use)
+    fit_generic_forces(pair, [use])
     found: GenericForce = pair.known[use]
     return found
 
 
-def _generic_force(pair: Pair, use: Use) -> GenericForce:
+def fit_generic_forces(pair: Pair, uses: Sequence[Use]) -> None:
+    """Fit several generic forces at once, which share what they stand beside.
+
+    Parameters
+    ----------
+    pair : Pair
+        Whose runs stay bounded; `generic_force` returns what was found.
+    uses : sequence of callable
+        Which features push which equation, in each of them.
+    """
+    asked = [use for use in uses if use not in pair.known]
+    if asked:
+        pair.known.update(zip(asked, _generic_forces(pair, asked), strict=True))
+
+
+def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
     problem, fit, held, held_fit = pair.problem, pair.fit, pair.held, pair.held_fit
     nuisance = _stacked(problem.rows(fit.point, fit.noise))
     free = nuisance.shape[1] - sum(map(len, fit.point.starts))
@@ -197,43 +211,56 @@ def _generic_force(pair: Pair, use: Use) -> GenericForce:
     # a run at the edge of stability has no derivatives
     none = GenericForce(np.zeros_like(seen), seen, held_fit.errors, np.zeros(free))
     if not np.isfinite(scale).all():
-        return none
+        return [none for _ in uses]
     left, values, right = tall_svd(nuisance / scale, _UNKNOWN)
+
+    def any_of(state: str, arguments: frozenset[str]) -> bool:
+        return any(use(state, arguments) for use in uses)
+
     knots = knots_of(problem)
-    pushed, scales = _pushed(problem, fit, knots, use, None)
+    pushed, scales, pushing = _pushed(problem, fit, knots, any_of, None)
     raw = _stacked([fit.noise.whiten(c) for c in pushed])
     with np.errstate(over="ignore"):
         size = np.sqrt((raw**2).sum(axis=0))
     if not np.isfinite(size).all():
-        return none
+        return [none for _ in uses]
     size[size == 0] = 1.0
     raw /= size
     along = left.T @ raw
     nu = np.concatenate([n.ravel() for n in fit.nu])
     # of errors with a memory fewer tell anything new
     alike = np.sqrt(correlation_factor(np.concatenate(fit.nu)))
-    delta = _ridge((raw - left @ along) / alike, (nu - left @ (left.T @ nu)) / alike)
-    # what the coefficients give back, where they can imitate
-    back = (-((right.T / values) @ (along @ delta)) / scale)[:free]
-    moved, _ = _pushed(held, held_fit, knots, use, scales)
+    raw -= left @ along
+    raw /= alike
+    nu = (nu - left @ (left.T @ nu)) / alike
+    moved, _, _ = _pushed(held, held_fit, knots, any_of, scales)
     point = replace(fit.point, starts=held_fit.point.starts)
     shown = held.slopes(point)
-    parts = [
-        columns @ (delta / size) + slopes[:, :, :free] @ back
-        for columns, slopes in zip(moved, shown, strict=True)
-    ]
     begun = held.slopes(held_fit.point)
     noise = held_fit.noise
-    whitened = _stacked([noise.whiten(p[:, :, None]) for p in parts])[:, 0]
     starts = _stacked([noise.whiten(s) for s in begun])
-    if not (np.isfinite(whitened).all() and np.isfinite(starts).all()):
-        return none
-    taken = np.linalg.lstsq(starts, whitened, rcond=_UNKNOWN)[0]
-    errors = tuple(
-        e - (part - slopes @ taken)
-        for e, part, slopes in zip(held_fit.errors, parts, begun, strict=True)
-    )
-    return GenericForce(whitened - starts @ taken, seen, errors, back)
+    out = []
+    for use in uses:
+        mine = [k for k, of in enumerate(pushing) if use(*of)]
+        delta = np.zeros(len(pushing))
+        delta[mine] = _ridge(raw[:, mine], nu)
+        # what the coefficients give back, where they can imitate
+        back = (-((right.T / values) @ (along @ delta)) / scale)[:free]
+        parts = [
+            columns @ (delta / size) + slopes[:, :, :free] @ back
+            for columns, slopes in zip(moved, shown, strict=True)
+        ]
+        whitened = _stacked([noise.whiten(p[:, :, None]) for p in parts])[:, 0]
+        if not (np.isfinite(whitened).all() and np.isfinite(starts).all()):
+            out.append(none)
+            continue
+        taken = np.linalg.lstsq(starts, whitened, rcond=_UNKNOWN)[0]
+        errors = tuple(
+            e - (part - slopes @ taken)
+            for e, part, slopes in zip(held_fit.errors, parts, begun, strict=True)
+        )
+        out.append(GenericForce(whitened - starts @ taken, seen, errors, back))
+    return out
 
 
 def contributions_beside(pair: Pair, use: Use = motion_and_commands) -> Array:
@@ -247,17 +274,21 @@ def contributions_beside(pair: Pair, use: Use = motion_and_commands) -> Array:
 
 def _pushed(
     problem: Problem, fit: Fit, knots: Array, use: Use, scales: Array | None
-) -> tuple[list[Array], Array]:
-    """Return ∂y of every feature in every equation that it pushes, and the features' sizes."""
+) -> tuple[list[Array], Array, list[tuple[str, frozenset[str]]]]:
+    """Return ∂y of every feature in every equation that it pushes, and the features' sizes.
+
+    And of each derivative the equation, and the signals that its feature is a function of.
+    """
     point = fit.point
     ship = point.ship
     made = [features(r, fit, s, knots) for r, s in zip(problem.runs, point.starts, strict=True)]
     if scales is None:
         scales = np.sqrt(np.mean(np.concatenate([m.values**2 for m in made]), axis=0))
         scales = np.where(scales > 0, scales, 1.0)
-    wanted = [
-        [k for k, arguments in enumerate(made[0].arguments) if use(state, arguments)]
-        for state in problem.structure.states
+    states, arguments = problem.structure.states, made[0].arguments
+    wanted = [[k for k, of in enumerate(arguments) if use(state, of)] for state in states]
+    pushing = [
+        (state, arguments[k]) for state, mine in zip(states, wanted, strict=True) for k in mine
     ]
     out = []
     for run, start, g in zip(problem.runs, point.starts, made, strict=True):
@@ -271,7 +302,7 @@ def _pushed(
             first += len(mine)
         slope = sensitivities(replace(linear, driven=driven))
         out.append(run.seen(ship, slope)[:, :, : driven.shape[2]])
-    return out, scales
+    return out, scales, pushing
 
 
 def _stacked(parts: Sequence[Array]) -> Array:

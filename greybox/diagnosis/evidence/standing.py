@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.evidence.held_out import Pair, Proof, proof_of
-from greybox.diagnosis.evidence.remainder import Use, contributions_beside, generic_force
+from greybox.diagnosis.evidence.remainder import (
+    Use,
+    contributions_beside,
+    fit_generic_forces,
+    generic_force,
+    motion_and_commands,
+)
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit, Point
@@ -86,11 +92,13 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
         better = not any(p.held_fit.escaped for p in pairs)
         proof = proof_of(np.array([np.inf if better else -np.inf]))
         return Standing(proof, None, 1.0, moved, clear, told, level)
+    use = _own_arguments(problem, hypothesis)
+    for pair in without:
+        fit_generic_forces(pair, [motion_and_commands, *([] if use is None else [use])])
     beside = [contributions_beside(p) for p in pairs]
     beyond = proof_of(np.concatenate([contributions_beside(p) for p in without])
                       - np.concatenate(beside))  # fmt: skip
     share, half = None, 1.0
-    use = _own_arguments(problem, hypothesis)
     if use is not None:
         plain = np.concatenate([np.concatenate(p.held.contributions(p.held_fit)) for p in without])
         own = np.concatenate([np.concatenate(p.held.contributions(p.held_fit)) for p in pairs])
