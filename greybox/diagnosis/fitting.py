@@ -15,6 +15,7 @@ from greybox.diagnosis.noise import Noise, fit_noise, free_run_noise
 from greybox.diagnosis.normal import bounded_step, inverse
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import CURRENTS, LogRun, Ship
+from greybox.diagnosis.thresholds import DECIDED
 from greybox.numerics.lagged_moments import automatic_lags, bartlett_sums
 
 Array = NDArray[np.float64]
@@ -244,8 +245,20 @@ class Problem:
             before += len(start)
         return out
 
-    def fit(self, point: Point, noise: Noise, most: int = _MOST) -> Fit:
-        """Minimise −2 log L over the free numbers at a given noise."""
+    def fit(self, point: Point, noise: Noise, most: int = _MOST, than: float = np.inf) -> Fit:
+        """Minimise −2 log L over the free numbers at a given noise.
+
+        Parameters
+        ----------
+        point : Point
+            Where it begins.
+        noise : Noise
+        most : int
+            Iterations at most.
+        than : float
+            −2 log L of a fit that this one is only compared with: where it stays far above that,
+            it ends once a step is small beside the difference.
+        """
         low, high = self.bounds(point)
         vector = np.clip(point.vector(), low, high)
         point = point.at(vector)
@@ -278,7 +291,7 @@ class Problem:
                 damping = max(10 * damping, 1e-3)
             if not accepted:
                 break
-            little = cost - trial_cost < _ENOUGH
+            little = cost - trial_cost < max(_ENOUGH, DECIDED * (trial_cost - than))
             point, vector, errors, nu, cost = (
                 trial, vector + step, trial_errors, trial_nu, trial_cost,
             )  # fmt: skip
@@ -442,15 +455,15 @@ class Problem:
         nu, cost = self.whitened(noise, fit.errors)
         return replace(fit, noise=noise, nu=tuple(nu), cost=cost)
 
-    def settle(self, fit: Fit, rounds: int = 2) -> Fit:
-        """Alternate between the noise and the fit."""
+    def settle(self, fit: Fit, rounds: int = 2, than: float = np.inf) -> Fit:
+        """Alternate between the noise and the fit; `than` as in `fit`."""
         for _ in range(rounds):
             if fit.escaped:
                 return fit
             noise = self.noise_of(fit.errors, fit.point, fit.noise)
             before = self.whitened(noise, fit.errors)[1]
-            fit = self.fit(fit.point, noise)
-            if before - fit.cost < 0.5:
+            fit = self.fit(fit.point, noise, than=than)
+            if before - fit.cost < max(0.5, DECIDED * (fit.cost - than)):
                 break
         return fit
 

@@ -165,23 +165,40 @@ def _filter(k: int, slopes: bool = False) -> ca.Function:
     """Return ``(x, level, pole, dt) -> transfer, L, memory, force``, or ``∂ transfer`` in x.
 
     ``transfer`` holds numerators, denominator and the logarithms of L's diagonal. The
-    covariance of the prediction solves the Riccati equation by doubling.
+    covariance of the prediction solves the Riccati equation by doubling: one function, called
+    again and again, since an expression of all doublings takes a second to differentiate.
 
     References
     ----------
     Anderson (1978); Chu, Fan and Lin (2005), the structure-preserving form.
     """
+    given = [ca.MX.sym("x", 2 + k), ca.MX.sym("level", k), ca.MX.sym("pole"), ca.MX.sym("dt")]
+    begun, doubled, ended = _riccati(k)
+    move, informed, p = begun(*given)
+    for _ in range(_DOUBLINGS):
+        move, informed, p = doubled(move, informed, p)
+    found = ended(p, *given)
+    if slopes:
+        found = [ca.jacobian(found[0], given[0])]
+    return ca.Function("filter", given, found)
+
+
+def _riccati(k: int) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Return functions to begin the Riccati equation's doubling, for one, and of its solution."""
     n = k + 1
     x, level = ca.SX.sym("x", 2 + k), ca.SX.sym("level", k)
     pole, dt = ca.SX.sym("pole"), ca.SX.sym("dt")
+    given = [x, level, pole, dt]
     a, q, r, force = _system(k, pole, dt, x, level)
     c = ca.horzcat(ca.SX.eye(k), ca.SX.zeros(k, 1))
-    move, informed, p = a.T, c.T @ ca.diag(1 / ca.diag(r)) @ c, q
-    for _ in range(_DOUBLINGS):
-        shrunk = ca.inv_minor(ca.densify(ca.SX.eye(n) + informed @ p))
-        later = p + move.T @ p @ shrunk @ move
-        informed = _symmetric(informed + move @ shrunk @ informed @ move.T)
-        p, move = _symmetric(later), move @ shrunk @ move
+    begun = [a.T, c.T @ ca.diag(1 / ca.diag(r)) @ c, q]
+
+    move, informed, p = (ca.SX.sym(name, n, n) for name in ("move", "informed", "p"))
+    shrunk = ca.inv_minor(ca.densify(ca.SX.eye(n) + informed @ p))
+    later = p + move.T @ p @ shrunk @ move
+    twice = _symmetric(informed + move @ shrunk @ informed @ move.T)
+    doubled = [move @ shrunk @ move, twice, _symmetric(later)]
+
     s = c @ p @ c.T + r
     gain = a @ p @ c.T @ ca.inv_minor(ca.densify(s))
     root = ca.chol(s).T
@@ -199,9 +216,17 @@ def _filter(k: int, slopes: bool = False) -> ca.Function:
         for j in range(k)
         for power in range(n + 1)
     ]
-    transfer = ca.densify(ca.vertcat(*numerators, *denominator, ca.log(ca.diag(root))))
-    found = [ca.jacobian(transfer, x)] if slopes else [transfer, root, a[-1, -1], ca.sqrt(force)]
-    return ca.Function("filter", [x, level, pole, dt], list(map(ca.densify, found)), {"cse": True})
+    transfer = ca.vertcat(*numerators, *denominator, ca.log(ca.diag(root)))
+    ended = [transfer, root, a[-1, -1], ca.sqrt(force)]
+
+    def function(name: str, of: list[ca.SX], told: list[ca.SX]) -> ca.Function:
+        return ca.Function(name, of, list(map(ca.densify, told)), {"cse": True})
+
+    return (
+        function("begun", given, begun),
+        function("doubled", [move, informed, p], doubled),
+        function("ended", [p, *given], ended),
+    )
 
 
 def _symmetric(matrix: ca.SX) -> ca.SX:

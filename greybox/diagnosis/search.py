@@ -489,13 +489,14 @@ def _beyond(cause: Candidate) -> float:
 
 def _without(problem: Problem, fit: Fit, cause: Candidate) -> Fit:
     """Return the fit without a cause, from where the others make up for it to first order."""
-    found = []
+    begun = []
     for vector in (_at_null(problem, fit, cause.hypothesis), fit.point.vector()):
         point = problem.drop(fit.point.at(vector), cause.hypothesis)
         cost = problem.whitened(fit.noise, problem.errors(point))[1]
-        found.append((cost, point))
-    point = min(found, key=lambda item: item[0])[1]
-    return problem.settle(problem.fit(point, fit.noise, most=FIRST), 2)
+        begun.append((cost, point))
+    point = min(begun, key=lambda item: item[0])[1]
+    found = problem.fit(point, fit.noise, most=FIRST, than=fit.cost)
+    return problem.settle(found, 2, than=fit.cost)
 
 
 def _at_null(problem: Problem, fit: Fit, hypothesis: Hypothesis) -> Array:

@@ -157,7 +157,13 @@ class FreeRunSelection:
                 self._most[i] = 0.0
 
     def path(
-        self, first: Sequence[str], stay: Sequence[str], most: int, *, earns: float = _EARNS
+        self,
+        first: Sequence[str],
+        stay: Sequence[str],
+        most: int,
+        *,
+        earns: float = _EARNS,
+        passed: Sequence[Selected] = (),
     ) -> list[Selected]:
         """Return the sets that selection passes through, each with its fit.
 
@@ -171,6 +177,8 @@ class FreeRunSelection:
             Terms at most.
         earns : float
             Share of the squared error that a term must take away.
+        passed : sequence of Selected
+            Where the same path, to fewer terms at most, has led already.
 
         Raises
         ------
@@ -179,17 +187,10 @@ class FreeRunSelection:
         OutOfTimeError
             Time was over before the first set; later the sets so far are returned.
         """
-        active = sorted(self.names.index(n) for n in first if n in self.names)
         kept = {self.names.index(n) for n in stay if n in self.names}
-        active, p = self._begun(active, most, earns)
-        at = self._fitted(self.runs, p, active)
-        if not np.isfinite(at.cost):
-            raise ExcitationError(
-                f"no free run of {len(active)} terms stays bounded on the {len(self.starts)} "
-                f"logs: use longer logs, or name a structure with --structure."
-            )
-        sets = [self._selected(active, at)]
-        seen = {frozenset(active)}
+        active, at = self._first(first, most, earns) if not passed else self._last(passed)
+        sets = [*passed] or [self._selected(active, at)]
+        seen = {frozenset(map(self.names.index, s.terms)) for s in sets}
         while len(active) < most and seconds_left() > 0:
             found = self._with_one_more(self.runs, at, active, earns, seen)
             if found is None:
@@ -207,6 +208,29 @@ class FreeRunSelection:
             seen.add(frozenset(active))
             sets.append(self._selected(active, at, "+" + self.names[came]))
         return sets
+
+    def _first(self, first: Sequence[str], most: int, earns: float) -> tuple[list[int], _Point]:
+        """Return the terms that a path begins with, and their fit.
+
+        Raises
+        ------
+        ExcitationError
+            No run of them stays bounded.
+        """
+        active = sorted(self.names.index(n) for n in first if n in self.names)
+        active, p = self._begun(active, most, earns)
+        at = self._fitted(self.runs, p, active)
+        if not np.isfinite(at.cost):
+            raise ExcitationError(
+                f"no free run of {len(active)} terms stays bounded on the {len(self.starts)} "
+                f"logs: use longer logs, or name a structure with --structure."
+            )
+        return active, at
+
+    def _last(self, passed: Sequence[Selected]) -> tuple[list[int], _Point]:
+        """Return the terms that a path came to, and their fit."""
+        active, p = sorted(map(self.names.index, passed[-1].terms)), passed[-1].p
+        return active, self._at(self.runs, p, self._value(self.runs, p), active)
 
     def fitted(self, found: Selected) -> Selected:
         """Return a set of terms with the parameters that fit these logs, from those that it has."""

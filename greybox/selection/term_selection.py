@@ -180,32 +180,51 @@ def select_terms(
         Refit.ahead([refit], [fitting for fitting, _ in parts])
         present_score = [_present_score(refit, *part, spread) for part in parts]
     turns = -(-len(laws) // lanes()) * (len(laws) > 1)
-    watch = _Watch(turns + len(beginnings) * -(-(1 + len(parts)) // lanes()))
+    watch = _Watch(turns + -(-len(beginnings) * (1 + len(parts)) // lanes()))
 
-    def paths_of(task: tuple[Sequence[TrialLog], str]) -> list[list[Selected]]:
-        of, what = task
-        chosen_on = selection if of is logs else FreeRunSelection(of, family, kind)
-        return _paths(chosen_on, beginnings, stay, most, watch, what)
+    def path_of(task: tuple[Sequence[TrialLog], str, int]) -> list[Selected]:
+        """Return a path, empty where none follows the logs."""
+        of, what, begun = task
+        passed: list[Selected] = []
+        chosen_on = selection
+        if of is not logs:
+            chosen_on = FreeRunSelection(of, family, kind)
+        elif begun == 0:
+            passed = of_laws[laws.index(law)]
+        try:
+            with watch.next(what):
+                return chosen_on.path(beginnings[begun], stay, most, passed=passed)
+        except OutOfTimeError:
+            # what was not tried must not count as bad
+            raise
+        except GreyboxError as error:
+            _log.info("no path from %d terms: %s", len(beginnings[begun]), error)
+            return []
 
-    def cost(of: ThrustLaw) -> float:
+    def few_terms(of: ThrustLaw) -> list[Selected]:
+        """Return the path to few terms with a thrust law, empty where time is over before."""
         selection = FreeRunSelection(with_law(logs, of), family, kind)
         try:
             with watch.next(f"thrust ~ {law_in_words(of)}"):
-                return selection.path(beginnings[0], stay, min(FEW, most))[-1].cost
+                return selection.path(beginnings[0], stay, min(FEW, most))
         except OutOfTimeError:
-            return np.inf
+            return []
 
     law, errors = laws[0], [np.nan]
+    of_laws: list[list[Selected]] = [[]]
     if len(laws) > 1:
-        errors = watch.over(cost, laws)
+        of_laws = watch.over(few_terms, laws)
+        errors = [sets[-1].cost if sets else np.inf for sets in of_laws]
         best_law = int(np.argmin(errors))
         law = laws[-1] if errors[-1] < (1 + _NEAR) * errors[best_law] else laws[best_law]
     logs = with_law(logs, law)
     thrust = law_in_words(law)
     selection = FreeRunSelection(logs, family, kind)
-    tasks = [(logs, "all logs")]
-    tasks += [(part[0], f"all but part {k}") for k, part in enumerate(_judging_parts(logs), 1)]
-    whole, *paths = watch.over(paths_of, tasks)
+    of_parts = [(logs, "all logs")]
+    of_parts += [(part[0], f"all but part {k}") for k, part in enumerate(_judging_parts(logs), 1)]
+    tasks = [(*part, begun) for part in of_parts for begun in range(len(beginnings))]
+    found_on = iter(watch.over(path_of, tasks))
+    whole, *paths = [[next(found_on) for _ in beginnings] for _ in of_parts]
     if not any(whole):
         raise ExcitationError(
             f"no free run of selected terms stays bounded on the {len(logs)} logs: use longer "
@@ -367,34 +386,6 @@ class _Watch:
             finally:
                 if seconds_left() <= 0:
                     self.cut[what] = None
-
-
-def _paths(
-    selection: FreeRunSelection,
-    beginnings: Sequence[Sequence[str]],
-    stay: Sequence[str],
-    most: int,
-    watch: _Watch,
-    what: str,
-) -> list[list[Selected]]:
-    """Return the path from each beginning, empty where none follows the logs.
-
-    Raises
-    ------
-    OutOfTimeError
-        Time was over before a first set: what was not tried must not count as bad.
-    """
-    found = []
-    for first in beginnings:
-        try:
-            with watch.next(what):
-                found.append(selection.path(first, stay, most))
-        except OutOfTimeError:
-            raise
-        except GreyboxError as error:
-            _log.info("no path from %d terms: %s", len(first), error)
-            found.append([])
-    return found
 
 
 def _score(errors: Sequence[Array], spread: Array) -> float:

@@ -127,16 +127,23 @@ def test_in_the_mirror_of_port_and_starboard_each_feature_becomes_its_image() ->
 
 def test_prior_of_forces_that_keep_and_that_break_the_symmetry() -> None:
     # the second and third are images of each other, the last has none
-    pushers = _Pushers(np.ones(1), np.array([1.0, -1.0, -1.0, 0.0]), np.array([0, 2, 1, 3]))
+    pushing = (("u", frozenset({"u"})),) * 4
+    pushers = _Pushers(
+        np.ones(1), pushing, np.array([1.0, -1.0, -1.0, 0.0]), np.array([0, 2, 1, 3])
+    )
+    every = pushers.used(ANYTHING)
     reflection = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, -1, 0, 0], [0, 0, 0, 0]])
     kept, broken = 0.7, 0.2
-    root = pushers.deviations(kept, broken)
+    root = pushers.deviations(every, kept, broken)
     own = (kept**2 + broken**2) / 2 * np.eye(4)
     expected = own + (kept**2 - broken**2) / 2 * reflection
     assert np.allclose(root @ root.T, expected, atol=1e-15)
     # alone, each keeps to its own
-    assert np.allclose(pushers.deviations(1.0, 0.0)[0, 0], 1.0)
-    assert np.allclose(pushers.deviations(0.0, 1.0)[0], 0.0)
+    assert np.allclose(pushers.deviations(every, 1.0, 0.0)[0, 0], 1.0)
+    assert np.allclose(pushers.deviations(every, 0.0, 1.0)[0], 0.0)
+    # one whose image takes no part is as free as both are together
+    left = pushers.deviations(np.array([0, 1]), kept, broken)
+    assert np.allclose(left @ left.T, expected[:2, :2], atol=1e-15)
 
 
 def test_heading_time_and_past_commands_are_no_part_of_the_rival(sailed) -> None:

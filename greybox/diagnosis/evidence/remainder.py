@@ -242,13 +242,26 @@ def generic_force(pair: Pair, use: Use = MOTION_AND_COMMANDS) -> GenericForce:
         Whose runs stay bounded; computed once for each use.
     use : Use
     """
-    if use not in pair.known:
-        pair.known[use] = _generic_force(pair, use)
+    fit_generic_forces(pair, [use])
     found: GenericForce = pair.known[use]
     return found
 
 
-def _generic_force(pair: Pair, use: Use) -> GenericForce:
+def fit_generic_forces(pair: Pair, uses: Sequence[Use]) -> None:
+    """Fit several generic forces at once, which share what they stand beside.
+
+    Parameters
+    ----------
+    pair : Pair
+        Whose runs stay bounded; `generic_force` returns what was found.
+    uses : sequence of Use
+    """
+    asked = [use for use in uses if use not in pair.known]
+    if asked:
+        pair.known.update(zip(asked, _generic_forces(pair, asked), strict=True))
+
+
+def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
     problem, fit, held, held_fit = pair.problem, pair.fit, pair.held, pair.held_fit
     nuisance = _stacked(problem.rows(fit.point, fit.noise))
     free = nuisance.shape[1] - sum(map(len, fit.point.starts))
@@ -259,15 +272,19 @@ def _generic_force(pair: Pair, use: Use) -> GenericForce:
     # a run at the edge of stability has no derivatives
     none = GenericForce(np.zeros_like(seen), seen, held_fit.errors, np.zeros(free))
     if not np.isfinite(scale).all():
-        return none
+        return [none for _ in uses]
     left, values, right = tall_svd(nuisance / scale, _UNKNOWN)
+
+    def any_of(state: str, arguments: frozenset[str]) -> bool:
+        return any(use.takes(state, arguments) for use in uses)
+
     knots = knots_of(problem)
-    pushed, pushers = _pushed(problem, fit, knots, use, None)
+    pushed, pushers = _pushed(problem, fit, knots, any_of, None)
     raw = _stacked([fit.noise.whiten(c) for c in pushed])
     with np.errstate(over="ignore"):
         size = np.sqrt((raw**2).sum(axis=0))
     if not np.isfinite(size).all():
-        return none
+        return [none for _ in uses]
     size[size == 0] = 1.0
     size = np.sqrt((size**2 + size[pushers.images] ** 2) / 2)
     raw /= size
@@ -275,29 +292,37 @@ def _generic_force(pair: Pair, use: Use) -> GenericForce:
     nu = np.concatenate([n.ravel() for n in fit.nu])
     # of errors with a memory fewer tell anything new
     alike = np.sqrt(correlation_factor(np.concatenate(fit.nu)))
-    rows, left_over = (raw - left @ along) / alike, (nu - left @ (left.T @ nu)) / alike
-    delta = _likeliest(rows, left_over, pushers, use.parity)
-    # what the coefficients give back, where they can imitate
-    back = (-((right.T / values) @ (along @ delta)) / scale)[:free]
-    moved, _ = _pushed(held, held_fit, knots, use, pushers.scales)
+    raw -= left @ along
+    raw /= alike
+    nu = (nu - left @ (left.T @ nu)) / alike
+    moved, _ = _pushed(held, held_fit, knots, any_of, pushers.scales)
     point = replace(fit.point, starts=held_fit.point.starts)
     shown = held.slopes(point)
-    parts = [
-        columns @ (delta / size) + slopes[:, :, :free] @ back
-        for columns, slopes in zip(moved, shown, strict=True)
-    ]
     begun = held.slopes(held_fit.point)
     noise = held_fit.noise
-    whitened = _stacked([noise.whiten(p[:, :, None]) for p in parts])[:, 0]
     starts = _stacked([noise.whiten(s) for s in begun])
-    if not (np.isfinite(whitened).all() and np.isfinite(starts).all()):
-        return none
-    taken = np.linalg.lstsq(starts, whitened, rcond=_UNKNOWN)[0]
-    errors = tuple(
-        e - (part - slopes @ taken)
-        for e, part, slopes in zip(held_fit.errors, parts, begun, strict=True)
-    )
-    return GenericForce(whitened - starts @ taken, seen, errors, back)
+    out = []
+    for use in uses:
+        mine = pushers.used(use)
+        delta = np.zeros(raw.shape[1])
+        delta[mine] = _likeliest(raw[:, mine], nu, pushers, use)
+        # what the coefficients give back, where they can imitate
+        back = (-((right.T / values) @ (along @ delta)) / scale)[:free]
+        parts = [
+            columns @ (delta / size) + slopes[:, :, :free] @ back
+            for columns, slopes in zip(moved, shown, strict=True)
+        ]
+        whitened = _stacked([noise.whiten(p[:, :, None]) for p in parts])[:, 0]
+        if not (np.isfinite(whitened).all() and np.isfinite(starts).all()):
+            out.append(none)
+            continue
+        taken = np.linalg.lstsq(starts, whitened, rcond=_UNKNOWN)[0]
+        errors = tuple(
+            e - (part - slopes @ taken)
+            for e, part, slopes in zip(held_fit.errors, parts, begun, strict=True)
+        )
+        out.append(GenericForce(whitened - starts @ taken, seen, errors, back))
+    return out
 
 
 def contributions_beside(pair: Pair, use: Use = MOTION_AND_COMMANDS) -> Array:
@@ -317,34 +342,46 @@ class _Pushers:
     ----------
     scales : ndarray
         (G,) sizes of the features.
+    pushing : tuple of (str, frozenset of str)
+        (m,) the equation, and the signals that the feature is a function of.
     signs, images : ndarray
         (m,) in the mirror each column becomes the one at its index here, times its sign; the sign
         is 0 where it has no image.
     """
 
     scales: Array
+    pushing: tuple[tuple[str, frozenset[str]], ...]
     signs: Array
     images: NDArray[np.intp]
 
-    def deviations(self, kept: float, broken: float) -> Array:
-        """Return a square root (m, m) of a prior covariance.
+    def used(self, use: Use) -> NDArray[np.intp]:
+        """Return the indices of those that take part."""
+        return np.array([k for k, of in enumerate(self.pushing) if use.takes(*of)], np.intp)
+
+    def deviations(self, mine: NDArray[np.intp], kept: float, broken: float) -> Array:
+        """Return a square root (k, k) of a prior covariance.
 
         Parameters
         ----------
+        mine : ndarray of int
+            (k,) those that take part.
         kept, broken : float
             Prior deviations of forces that keep the symmetry of port and starboard, and of those
             that break it.
         """
-        paired = self.signs != 0
+        place = np.full(len(self.signs), -1)
+        place[mine] = np.arange(len(mine))
+        image, sign = place[self.images[mine]], self.signs[mine]
+        paired = (sign != 0) & (image >= 0)
         alone = np.sqrt((kept**2 + broken**2) / 2)
         root = np.diag(np.where(paired, (kept + broken) / 2, alone))
         where = np.flatnonzero(paired)
-        root[where, self.images[where]] += self.signs[where] * (kept - broken) / 2
+        root[where, image[where]] += sign[where] * (kept - broken) / 2
         return root
 
 
 def _pushed(
-    problem: Problem, fit: Fit, knots: Array, use: Use, scales: Array | None
+    problem: Problem, fit: Fit, knots: Array, takes: Takes, scales: Array | None
 ) -> tuple[list[Array], _Pushers]:
     """Return ∂y of every feature in every equation that it pushes, and which they are."""
     point = fit.point
@@ -353,11 +390,8 @@ def _pushed(
     if scales is None:
         scales = np.sqrt(np.mean(np.concatenate([m.values**2 for m in made]), axis=0))
         scales = np.where(scales > 0, scales, 1.0)
-    states = problem.structure.states
-    wanted = [
-        [k for k, arguments in enumerate(made[0].arguments) if use.takes(state, arguments)]
-        for state in states
-    ]
+    states, arguments = problem.structure.states, made[0].arguments
+    wanted = [[k for k, of in enumerate(arguments) if takes(state, of)] for state in states]
     out = []
     for run, start, g in zip(problem.runs, point.starts, made, strict=True):
         shown = run.run(ship, start)
@@ -378,19 +412,21 @@ def _pushed(
         for (i, k), image in zip(columns, images, strict=True)
     ]
     images = [at if image < 0 else image for at, image in enumerate(images)]
-    return out, _Pushers(scales, np.array(signs), np.array(images, np.intp))
+    pushing = tuple((states[i], arguments[k]) for i, k in columns)
+    return out, _Pushers(scales, pushing, np.array(signs), np.array(images, np.intp))
 
 
 def _stacked(parts: Sequence[Array]) -> Array:
     return np.concatenate([p.reshape(-1, p.shape[2]) for p in parts])
 
 
-def _likeliest(rows: Array, nu: Array, pushers: _Pushers, parity: int) -> Array:
-    """Return coefficients (m,) by the strengths that make the innovations likeliest."""
-    if parity:
-        tried = [pushers.deviations(float(parity > 0), float(parity < 0))]
-    else:
-        tried = [pushers.deviations(1.0, broken) for broken in _BROKEN]
+def _likeliest(rows: Array, nu: Array, pushers: _Pushers, use: Use) -> Array:
+    """Return coefficients (k,) by the strengths that make the innovations likeliest."""
+    ways = [(float(use.parity > 0), float(use.parity < 0))]
+    if not use.parity:
+        ways = [(1.0, broken) for broken in _BROKEN]
+    mine = pushers.used(use)
+    tried = [pushers.deviations(mine, *way) for way in ways]
     square, along = rows.T @ rows, rows.T @ nu
     found = [(_ridge(root.T @ square @ root, root.T @ along), root) for root in tried]
     (_, best), root = min(found, key=lambda f: f[0][0])
@@ -398,12 +434,12 @@ def _likeliest(rows: Array, nu: Array, pushers: _Pushers, parity: int) -> Array:
 
 
 def _ridge(square: Array, along: Array) -> tuple[float, Array]:
-    """Return −2 log of the marginal likelihood, constants apart, and coefficients (m,).
+    """Return −2 log of the marginal likelihood, constants apart, and coefficients (k,).
 
     Parameters
     ----------
     square, along : ndarray
-        (m, m), (m,) products of the rows, and of the rows with the innovations.
+        (k, k), (k,) products of the rows, and of the rows with the innovations.
     """
     squares, vectors = np.linalg.eigh(square)
     known = squares > _UNKNOWN * squares[-1]

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.evidence.held_out import Pair, Proof, proof_of
 from greybox.diagnosis.evidence.remainder import (
+    MOTION_AND_COMMANDS,
     Use,
     contributions_beside,
+    fit_generic_forces,
     generic_force,
     parity,
 )
@@ -91,11 +93,13 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
         better = not any(p.held_fit.escaped for p in pairs)
         proof = proof_of(np.array([np.inf if better else -np.inf]))
         return Standing(proof, None, 1.0, moved, clear, told, level)
+    use = _own_arguments(problem, hypothesis)
+    for pair in without:
+        fit_generic_forces(pair, [MOTION_AND_COMMANDS, *([] if use is None else [use])])
     beside = [contributions_beside(p) for p in pairs]
     beyond = proof_of(np.concatenate([contributions_beside(p) for p in without])
                       - np.concatenate(beside))  # fmt: skip
     share, half = None, 1.0
-    use = _own_arguments(problem, hypothesis)
     if use is not None:
         plain = np.concatenate([np.concatenate(p.held.contributions(p.held_fit)) for p in without])
         own = np.concatenate([np.concatenate(p.held.contributions(p.held_fit)) for p in pairs])
