@@ -279,7 +279,7 @@ def bad_csv():
     yield "control", b"\x01\x02\x03\x04abc\n" * 50, "control characters"
     yield "ambiguous", b"t,u\n" + b"1,5,2,5\n" * 9, "2 names in its header and 4 fields"
     yield "words", b"t,u\n" + b"one,two\n" * 9, "no rows|holds words"
-    yield "dates", b"time,u\n" + b"5/1/24 3:00 PM,2\n" * 9, "holds words where the time"
+    yield "dates", b"time,u\n" + b"5/1/24 3:00 PM,2\n" * 9, "holds '5/1/24 3:00 PM' where the time"
     yield "no time", b"u,v\n" + b"1,2\n" * 9, "no column 't'"
     yield "long line", b"t,u\n1,2\n" + b"7" * (1 << 23) * 3, "no column|cannot read|hold"
     yield "narrow", b"t,u,v\n1,2,3\n" + b"1,2,3\n" * 80 + b"1,2\n" * 500, "500 of 581 rows"

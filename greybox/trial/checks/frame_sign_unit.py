@@ -142,7 +142,7 @@ _PSI = (
     ),
     ColumnHypothesis(
         "unit", "psi", ("psi",), _degrees, (mend("scale", ("psi",), factor=_DEG),),
-        "psi holds degrees under a radian name",
+        "psi holds degrees where a log has radians",
         declare_unit(("psi",), "deg"), 180 / np.pi, "deg per rad",
     ),
     ColumnHypothesis(

@@ -11,6 +11,7 @@ from greybox.channels import ANGLES
 from greybox.numerics.robust import FROM_MEDIAN, robust_deviation
 from greybox.rotation import body_to_ned
 from greybox.trial.checks.finding import Finding, declare_unit
+from greybox.trial.convert.channel_mapping import beyond_reach
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, runs
 from greybox.trial.gaps import GAP, HOLE, usual_step
@@ -510,18 +511,11 @@ def _moves(name: str, start: float, stop: float, signals: list[Signal], step: fl
 def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
     """Find degrees under a radian name by range: angles of wind and thrusters."""
     found = []
-    moved = [m for t in vessel.thrusters for m in t.movements]
-    rudders = {c for kind, *both, _ in moved if kind == "rudder" for c in both}
     for s in recording.signals:
         if s.name not in (ANGLES | vessel.recorded_angles) - {"psi", "cog"}:
             continue
-        _, value = clean(s)
-        if len(value) < 3:
-            continue
-        largest = float(np.quantile(np.abs(value), 0.98))
-        # no rudder passes a right angle, no wrapped angle two turns
-        limit = np.pi / 2 if s.name in rudders else 4 * np.pi
-        if largest > limit:
+        if beyond := beyond_reach(s, vessel):
+            largest, limit = beyond
             factor = float(np.pi / 180)
             found.append(
                 Finding(
@@ -531,7 +525,7 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
                     (180 / np.pi, 180 / np.pi),
                     "deg per rad",
                     f"{s.name} reaches {largest:.4g}, above the {limit:.3g} rad that it can "
-                    f"reach: it holds degrees under a radian name",
+                    f"reach: it holds degrees where a log has radians",
                     declare_unit((s.name,), "deg"),
                     (s.name,),
                     (mend("scale", (s.name,), factor=factor),),
