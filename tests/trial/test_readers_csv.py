@@ -6,6 +6,7 @@ import contextlib
 import datetime
 import pickle
 import zipfile
+from time import process_time
 
 import numpy as np
 import pandas as pd
@@ -552,3 +553,12 @@ def test_damaged_numbers_in_columns_called_n_and_e_are_no_positions(tmp_path):
         {"name": "S", "length": 5, "thruster": [{"type": "fixed", "speed": "rps"}]}
     )
     assert not {"x_n", "y_n"} & set(read_recording(path, ship).names)
+
+
+def test_a_number_of_a_million_digits_is_read_in_time(tmp_path):
+    """Its digits are looked at once, whatever follows them."""
+    start = process_time()
+    assert not cells.is_number("9" * 10**6 + ",1;2", comma=True)
+    assert process_time() - start < 1.0
+    rows = b"t,u\n" + b"".join(b"%d,2\n" % k for k in range(9)) + b"9" * 10**6 + b",2\n"
+    assert len(read(written(tmp_path / "x.csv", rows))[0]["u"]) == 10

@@ -232,8 +232,8 @@ def table_columns(
         likely = next(timed, "tvec")
         raise LogError(
             f"'{table.path.name}' has no column 't'.{suggestion('t', table.columns)} "
-            f"{advice} the time column in the vessel file's [columns], such as \"{likely}\" = "
-            f"{{ name = \"t\", unit = \"s\" }}. Its columns: {', '.join(table.columns[:30])}."
+            f'{advice} the time column in the vessel file\'s [columns], such as "{likely}" = '
+            f'{{ name = "t", unit = "s" }}. Its columns: {", ".join(table.columns[:30])}.'
         )
     time = assigned["t"].raw
     if time in table.text:
