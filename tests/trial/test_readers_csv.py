@@ -234,7 +234,7 @@ def test_thousands_of_columns(tmp_path):
 def test_columns_of_one_name(tmp_path):
     _, table = read(written(tmp_path / "x.csv", "t,u,u,u,u.2\n1,2,3,4,5\n2,3,4,5,6\n"))
     assert len(set(table.columns)) == 5
-    assert "column 'u' stands 3 times: it is called 'u.3' there" in table.notes
+    assert "3 columns are called 'u': the last is taken as 'u.3'" in table.notes
 
 
 def test_columns_may_stand_in_any_order(tmp_path):

@@ -340,7 +340,7 @@ def reading_findings(reading: ColumnReading, names: Sequence[str] = ()) -> list[
                 c.value,
                 (c.value, c.value),
                 c.unit,
-                f"{c.words}: only so do {tied} agree (log-likelihood higher by "
+                f"{c.words}: only then do {tied} agree (log-likelihood higher by "
                 f"{reading.gain:.0f}{beside}){doubt}",
                 c.fix,
                 c.channels,

@@ -60,8 +60,12 @@ def time_findings(recording: Recording) -> list[Finding]:
         if repeated or back:
             count = repeated + back
             k = int(np.flatnonzero(steps <= 0)[0])
-            what = [f"{repeated} repeat the one before"] if repeated else []
-            what += [f"{back} go back"] if back else []
+            what = (
+                [f"{repeated} repeat{'' if repeated > 1 else 's'} the one before"]
+                if repeated
+                else []
+            )
+            what += [f"{back} go{'' if back > 1 else 'es'} back"] if back else []
             found.append(
                 Finding(
                     "duplicate_time",
@@ -69,8 +73,8 @@ def time_findings(recording: Recording) -> list[Finding]:
                     float(count),
                     (float(count), float(count)),
                     "1",
-                    f"of {len(finite)} times of {listed(names)}, {' and '.join(what)}, the first "
-                    f"after t = {finite[k]:.6g} s",
+                    f"of the {len(finite)} times of {listed(names)} {' and '.join(what)}, the "
+                    f"first after t = {finite[k]:.6g} s",
                     "sort the rows by time and keep the first of those that repeat "
                     "(import --fix does)",
                     ("t",),
@@ -197,8 +201,8 @@ def spike_findings(recording: Recording) -> list[Finding]:
                 (size - half, size + half),
                 s.unit or "1",
                 f"{len(spikes)} sample{'s' if len(spikes) > 1 else ''} of {s.name} "
-                f"stand{'' if len(spikes) > 1 else 's'} out of the neighbours, the "
-                f"largest by {size:.3g} {s.unit} at t = {t[worst]:.6g} s, "
+                f"{'stand out from their' if len(spikes) > 1 else 'stands out from its'} "
+                f"neighbours, the largest by {size:.3g} {s.unit} at t = {t[worst]:.6g} s, "
                 f"where the neighbours scatter by {scale:.2g}",
                 "leave those samples out (import --fix does; what is missing is bridged where "
                 "one sample is, else a gap)",
