@@ -92,11 +92,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Read, diagnose, report, write."""
     from dataclasses import replace
+    from pathlib import Path
+    from shlex import quote
 
     from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
     from greybox.files import check_targets
     from greybox.model.catalogue import get_structure, structure_for
     from greybox.model.model import load_model
+    from greybox.report.page import typed
     from greybox.selection.estimate_stream import BYTES
     from greybox.selection.stretches import draw
     from greybox.trial.log_files import find_logs
@@ -139,8 +142,17 @@ def run(options: argparse.Namespace) -> None:
             own_pace=options.sample_time is None,
         ),
     )
-    diagnosis = replace(diagnosis, notes=(*left_out, *also, *diagnosis.notes))
     record = provenance(options) | {"logs": _read(logs), "validate": _read(validate)}
+    vessel_typed, stem = typed(record, "vessel", "V"), Path(options.out or "MODEL").with_suffix("")
+    steps = [
+        step.replace("--vessel V", f"--vessel {vessel_typed}")
+        .replace("--model MODEL", f"--model {typed(record, 'out', 'MODEL')}")
+        .replace("MODEL.", f"{quote(str(stem))}.")
+        for step in diagnosis.next_steps
+    ]
+    diagnosis = replace(
+        diagnosis, next_steps=tuple(steps), notes=(*left_out, *also, *diagnosis.notes)
+    )
     if options.out:
         _save(diagnosis, options.out, record)
 

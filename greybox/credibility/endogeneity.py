@@ -53,7 +53,7 @@ def endogeneity(equation: Equation, *, decisive: bool = True) -> TestResult:
         gap = np.abs(theta - equation.solution.theta) / std
         far = int(np.argmax(gap))
         return Conclusion(
-            "least squares is not told from instrumental variables here."
+            "least squares and instrumental variables do not differ beyond chance here."
             if suffices
             else f"least squares is biased here, most in {equation.labels[far]} "
             f"(by {gap[far]:.1f} standard errors of the instrumental estimate).",

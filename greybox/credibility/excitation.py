@@ -46,16 +46,16 @@ def excitation(equation: Equation) -> TestResult:
     worst = int(np.argmax(inflation))
     missing = combination(labels, solution.weakest, _NAMED)
     verdict = (
-        f"{missing} is weakly determined: move what these multiply separately."
+        f"{missing} is weakly determined: change what these parameters multiply separately."
         if ratio < _WEAK
-        else f"every direction is determined, the weakest is {missing}."
+        else f"every combination of the parameters is determined, the weakest is {missing}."
     )
     return TestResult(
         "excitation",
         "the regressors that the instruments explain are independent",
         ratio,
         None,
-        f"smallest relative singular value {ratio:.1e} ({_WEAK:.0e} asked for): {verdict} "
+        f"smallest relative singular value {ratio:.1e} ({_WEAK:.0e} is needed): {verdict} "
         f"{labels[worst]} has the largest variance inflation, {inflation[worst]:.3g}.",
         _WEAK,
         ratio >= _WEAK,

@@ -104,7 +104,7 @@ def convergence(estimate: Estimate) -> tuple[TestResult, ...]:
     return (
         TestResult(
             "convergence",
-            "the iteration ended at an estimate that it no longer moves",
+            "the iteration ended at an estimate that further steps do not change",
             float(estimate.iterations),
             None,
             sentence,

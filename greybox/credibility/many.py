@@ -79,8 +79,8 @@ def many_instruments(equation: Equation, biases: frozenset[str]) -> TestResult:
         null,
         abs(ratio[worst]),
         None,
-        f"instruments of {len(equation.z)} logs shift {worst} by {ratio[worst]:+.2f} standard "
-        f"errors towards least squares, the most of all"
+        f"the instruments of {len(equation.z)} logs bias the estimate towards least squares, most "
+        f"{worst}, by {ratio[worst]:+.2f} standard errors"
         + (f" ({', '.join(hit)} by more than half): use fewer, longer logs." if hit else "."),
         TOLERATED_BIAS,
         not hit,

@@ -163,8 +163,8 @@ def margin_bias(evidence: Evidence) -> TestResult:
         null,
         abs(ratio[worst]),
         None,
-        f"noise near sign changes shifts {worst} by {ratio[worst]:+.2f} standard errors, "
-        f"the most of all"
+        f"noise near sign changes biases the parameters, most {worst}, by {ratio[worst]:+.2f} "
+        f"standard errors"
         + ("." if not hit else ": cut samples with --margin-u, --margin-v, or avoid sign changes."),
         TOLERATED_BIAS,
         not hit,

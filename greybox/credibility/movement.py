@@ -30,7 +30,9 @@ def movement(evidence: Evidence) -> TestResult:
     name, null = "movement", "the logs move what every parameter multiplies"
     predictor = evidence.predictor
     if not predictor.structure.marine:
-        return not_applicable(name, null, "what is no ship has no speed to measure by")
+        return not_applicable(
+            name, null, "the structure is not of a ship, so there is no speed to compare with"
+        )
     share = movements(evidence.logs, predictor.structure)
     for force in set(predictor.structure.inputs) & share.keys():
         if share[force] >= _LEAST and is_noise(evidence.logs, force, share[force]):
@@ -61,14 +63,14 @@ def movement(evidence: Evidence) -> TestResult:
             large = weight >= _NAMED * weight.max()
             apart += [n for n, here in zip(equation.labels, large, strict=True) if here]
     told = [
-        f"{signal} moves by {share[signal]:.1g} of what "
-        + ("its thrusters push" if signal in predictor.structure.inputs else "the ship's speed is")
-        + f" ({_LEAST:g} asked for), so {', '.join(n for n, s in found.items() if s == signal)} "
-        f"rests on rounding or noise"
+        f"{signal} changes by {share[signal]:.1g} of "
+        + ("its thrusters' force" if signal in predictor.structure.inputs else "the ship's speed")
+        + f" (at least {_LEAST:g} is needed), so "
+        f"{', '.join(n for n, s in found.items() if s == signal)} rests on rounding or noise"
         for signal in dict.fromkeys(found.values())
     ]
     if apart:
-        told.append(f"the logs do not tell {', '.join(apart)} apart but for rounding")
+        told.append(f"only rounding tells {', '.join(apart)} apart in the logs")
     return TestResult(
         name,
         null,
@@ -76,7 +78,7 @@ def movement(evidence: Evidence) -> TestResult:
         None,
         f"{'; '.join(told)}: move it, or leave it out of the structure."
         if told
-        else "every force and velocity moves, and what multiplies each parameter.",
+        else "every force, every velocity and what each parameter multiplies changes enough.",
         _LEAST,
         not told,
         tuple(dict.fromkeys([*found, *apart])),

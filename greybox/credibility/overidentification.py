@@ -73,7 +73,7 @@ def _conclude(score: ScoreStatistic, agree: bool) -> Conclusion:
         return Conclusion("the instruments agree.", True, {})
     return Conclusion(
         "the instruments contradict each other: the model lacks something that the inputs move, or "
-        "logs differ.",
+        "the logs differ from one another.",
         False,
         {},
     )

@@ -21,6 +21,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.selection.estimate import at_own_pace
+from greybox.selection.prediction import require_distinct, require_others
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
@@ -110,6 +111,8 @@ def diagnose(
 
     say("log checks")
     logs, validate = as_segments(logs), as_segments(validate, 0)
+    require_distinct(logs)
+    require_others(logs, validate)
     paced: list[str] = []
     if model is None and options.own_pace:
         logs, validate = _at_own_pace(logs, validate, paced)

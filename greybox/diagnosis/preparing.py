@@ -14,6 +14,7 @@ from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import CURRENTS
 from greybox.errors import LogError, UsageError, suggestion
+from greybox.estimation.informative import require_commands, require_motion
 from greybox.model.catalogue import for_inputs, get_structure, structure_for
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
@@ -121,12 +122,15 @@ def prepare(
     logs = _long_enough(logs)
     validate = _long_enough(validate) if validate else []
     causes = _chosen(ids)
+    if model is None:
+        require_commands(logs)
     kinematics = judged_by_kinematics([*logs, *validate])
     findings = [f for f in kinematics.findings if f.id in causes]
     vessel = mended(logs[0].vessel if model is None else model.vessel, findings)
     logs = [correct_log(log, vessel) for log in logs]
     validate = [correct_log(log, vessel) for log in validate]
     start = _structure(structure, logs, model)
+    require_motion(logs, start)
     context = _context(start, [*logs, *validate], model)
     # of a clock of one channel the kinematics tell all; an arm or a bias may be shared by all
     told = decided(findings) | {a for a in kinematics.agreeing if a.startswith("clock_offset:")}

@@ -127,24 +127,8 @@ def require_informative(
         cancel but for rounding, or the heading does not change for a predictor that must tell
         current north from east.
     """
-    commands = logs[0].vessel.commands
-    angles = logs[0].vessel.angle_commands
-    held = {c: _held([log[c] for log in logs], c in angles) for c in commands}
-    if None not in held.values():
-        noisy = [f"{c} by {spread:.2g}" for c, spread in held.items() if spread]
-        raise ExcitationError(
-            f"every thruster command is constant over the log ({', '.join(commands)}"
-            + (f"; but for noise, which moves {', '.join(noisy)}" if noisy else "")
-            + "), so its effect cannot be told from a constant: change the commands during the "
-            "trial."
-        )
-    if all(float(np.ptp(log[s])) == 0.0 for log in logs for s in structure.states):
-        raise ExcitationError(
-            f"{', '.join(structure.states)} do not change over the whole log, so the motion does "
-            f"not show what the commands do: see whether the columns hold what was measured "
-            f"(greybox "
-            f"check), and give a log in which the ship moves."
-        )
+    require_commands(logs)
+    require_motion(logs, structure)
     if structure.marine:
         share = movements(logs, structure)
         # a rudder amidships, or a propeller at rest, is named by the equations
@@ -170,3 +154,29 @@ def require_informative(
                 f"{np.degrees(ADVISED_HEADING):.0f} deg). Turn during the trial, or use "
                 f"--predictor {predictor.plain}."
             )
+
+
+def require_commands(logs: Sequence[TrialLog]) -> None:
+    """Refuse logs over which no thruster command changes by more than its noise."""
+    commands = logs[0].vessel.commands
+    angles = logs[0].vessel.angle_commands
+    held = {c: _held([log[c] for log in logs], c in angles) for c in commands}
+    if None not in held.values():
+        noisy = [f"{c} by {spread:.2g}" for c, spread in held.items() if spread]
+        raise ExcitationError(
+            f"every thruster command is constant over the log ({', '.join(commands)}"
+            + (f"; but for noise, which moves {', '.join(noisy)}" if noisy else "")
+            + "), so its effect cannot be told from a constant: change the commands during the "
+            "trial."
+        )
+
+
+def require_motion(logs: Sequence[TrialLog], structure: Structure) -> None:
+    """Refuse logs over which no state of a structure changes."""
+    if all(float(np.ptp(log[s])) == 0.0 for log in logs for s in structure.states):
+        raise ExcitationError(
+            f"{', '.join(structure.states)} do not change over the whole log, so the motion does "
+            f"not show what the commands do: see whether the columns hold what was measured "
+            f"(greybox "
+            f"check), and give a log in which the ship moves."
+        )

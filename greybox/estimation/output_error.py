@@ -201,7 +201,7 @@ def estimate_oe(
     fitted = _fit(predictor, logs, start, options)
     if not (np.isfinite(fitted.fit.cost) and fitted.bounded):
         raise ExcitationError(
-            f"the free run of {predictor.structure.name} leaves every bound from this start: give "
+            f"the free run of {predictor.structure.name} diverges from this start: give "
             f"a stable model with --nominal, a smaller structure, or --method iv."
         )
     return _result(fitted, logs, options)
@@ -650,10 +650,11 @@ def _excitation_tests(
         least = mine[int(np.argmin(share[mine]))]
         passed = ratio >= _WEAK
         found = (
-            f"every direction is determined, the weakest combines {', '.join(names)}"
+            f"every combination of the parameters is determined, the weakest is of "
+            f"{', '.join(names)}"
             if passed
-            else f"the combination of {', '.join(names)} is weakly determined: move what these "
-            f"multiply separately"
+            else f"the combination of {', '.join(names)} is weakly determined: change what "
+            f"these parameters multiply separately"
         )
         out.append(
             TestResult(
@@ -661,9 +662,9 @@ def _excitation_tests(
                 "the sensitivities of the run are independent",
                 ratio,
                 None,
-                f"smallest relative singular value {ratio:.1e} ({_WEAK:.0e} asked for): {found}. "
-                f"{model.parameters[free[least]]} has the least share of its own, "
-                f"{float(share[least]):.1e}.",
+                f"smallest relative singular value {ratio:.1e} ({_WEAK:.0e} is needed): {found}. "
+                f"Of the sensitivity to {model.parameters[free[least]]} the least, "
+                f"{float(share[least]):.1e}, cannot be explained by those to the others.",
                 _WEAK,
                 passed,
                 tuple(names),

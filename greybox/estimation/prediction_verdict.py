@@ -291,8 +291,8 @@ class HeldCommandsDiverge(Reason):
         """At which commands, and when."""
         at = ", ".join(f"{name} {value:.3g}" for name, value in self.commands.items())
         return (
-            f"its free run diverges with {self.count} of {self.settings} settings of the logs "
-            f"held, first after {self.after:.3g} s ({at})"
+            f"its free run diverges with {self.count} of {self.settings} settings of the commands "
+            f"of the logs, each held constant, first after {self.after:.3g} s ({at})"
         )
 
 

@@ -135,8 +135,9 @@ def _table(estimate: EstimateValues) -> list[str]:
     sets = weak_safe_sets(estimate.tests)
     # only instruments can be weak
     safe = 24 if sets else 0
+    named = 1 + max(11, *(len(c.label) for c in estimate.predictor.columns if not c.is_bias))
     lines = [
-        f"{'parameter':<12}{'value':>10}{'std err':>9}{'[0.025':>11}{'0.975]':>11}"
+        f"{'parameter':<{named}}{'value':>10}{'std err':>9}{'[0.025':>11}{'0.975]':>11}"
         f"{'weak-safe 95 %' if sets else '':>{safe}}"
         f"{'per second':>11}  unit"
     ]
@@ -151,7 +152,7 @@ def _table(estimate: EstimateValues) -> list[str]:
             value, std = estimate.theta[i], errors[i]
             term = structure.terms[structure.index(column.terms[0])]
             lines.append(
-                f"{column.label:<12}{value:>10.4g}{std:>9.2g}{value - 1.96 * std:>11.4g}"
+                f"{column.label:<{named}}{value:>10.4g}{std:>9.2g}{value - 1.96 * std:>11.4g}"
                 f"{value + 1.96 * std:>11.4g}"
                 f"{set_in_words(sets.get(column.label)):>{safe}}"
                 f"{value / estimate.sample_time:>11.4g}  {parameter_unit(term, unit)}"

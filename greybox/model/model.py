@@ -494,7 +494,7 @@ def load_model(path: str | Path) -> ManoeuvringModel:
         ) from error
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise ModelFileError(
-            f"'{path.name}' is not a model file ({error}): name the file that "
+            f"'{path.name}' is not a model file, which is JSON: name the file that "
             f"'greybox estimate … --out' wrote."
         ) from error
     model = model_from_dict(data, path.name)

@@ -362,4 +362,6 @@ def compared_line(row: Compared, length: float) -> str:
 def _shown(value: MonteCarloQuantity, angle: bool) -> str:
     factor, unit = (180 / math.pi, " deg") if angle else (1.0, "")
     low, high = (b * factor for b in value.interval)
-    return f"{value.value * factor:.4g}{unit} (95 %: {low:.4g} to {high:.4g})"
+    # what was ordered is the same in every draw
+    interval = f" (95 %: {low:.4g} to {high:.4g})" if low < high else ""
+    return f"{value.value * factor:.4g}{unit}{interval}"

@@ -389,6 +389,12 @@ class Vessel(DisplayMixin):
         pairs = (c for a in self.actuators if a.angular for c in (a.command, a.feedback))
         return self.angle_commands | frozenset(pairs)
 
+    @property
+    def rudders(self) -> frozenset[str]:
+        """Those of `recorded_angles` that are rudder angles, which no full turn can wrap."""
+        moved = [m for t in self.thrusters for m in t.movements]
+        return frozenset(c for kind, *both, _ in moved if kind == "rudder" for c in both if c)
+
     def unit(self, name: str) -> str | None:
         """Return the SI unit of a channel or thruster column, None where any unit is kept."""
         if name in self.recorded_angles:

@@ -122,6 +122,8 @@ def test_a_plan_of_commands_is_simulated_from_a_start(noisy_csv, tmp_path, capsy
         (["estimate", "{log}", "--vessel", "thesis", "--structure", "thesys"], "Did you mean"),
         (["estimate", "{log}", "--vessel", "thesis", "--sample-time", "1.5"], "whole multiple"),
         (["compare", "{log}", "--log", "{log}"], "is not a model file"),
+        (["diagnose", "{log}", "--vessel", "thesis", "--validate", "{log}"], "Name it once"),
+        (["diagnose", "{log}", "{log}", "--vessel", "thesis"], "name each trial once"),
         (["reproduce", "chapter4", "--runs", "1"], "needs at least 2 runs"),
         (["reproduce", "chapter4", "--estimate", "x"], "belong to chapter7"),
         (["reproduce", "chapter7", "--estimate", "x"], "together"),

@@ -66,7 +66,7 @@ def test_a_force_below_any_misalignment_is_excepted(method, units):
     assert told.passed is False
     assert told.parameters == ("Ymu",)
     assert told.statistic == pytest.approx(4e-5, rel=0.2)
-    assert "tauy moves by 4e-05 of what its thrusters push (0.001 asked for), so Ymu" in (
+    assert "tauy changes by 4e-05 of its thrusters' force (at least 0.001 is needed), so Ymu" in (
         told.sentence
     )
 

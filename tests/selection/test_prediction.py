@@ -236,7 +236,8 @@ def test_a_model_that_runs_away_where_commands_are_held_is_poor(estimate, logs):
     assert found is not None
     assert set(found.commands) == set(estimate.vessel.commands)
     assert 0 < found.after < 300
-    assert f"diverges with {found.count} of 16 settings of the logs held" in found.sentence
+    words = "of 16 settings of the commands of the logs, each held constant"
+    assert f"diverges with {found.count} {words}" in found.sentence
     assert held_commands_diverge(model, logs) is None
     judged = weigh_prediction(estimate.prediction.channels, JudgedOn.HELD_OUT, found=[found])
     assert judged.level is PredictionLevel.POOR

@@ -286,7 +286,7 @@ def test_times_that_repeat_and_go_back(ship):
     f = found_in(d, ship)
     assert set(f) == {"duplicate_time"}
     assert f["duplicate_time"].value == 2
-    assert "1 repeat the one before and 1 go back" in f["duplicate_time"].evidence
+    assert "1 repeats the one before and 1 goes back" in f["duplicate_time"].evidence
 
 
 def test_gap_nan_spike_stuck(ship):

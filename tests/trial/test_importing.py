@@ -426,3 +426,18 @@ def test_the_old_name_of_the_longest_gap_still_works():
     with pytest.warns(DeprecationWarning, match="max_gap"):
         assert ImportOptions(hole=3.0).max_gap == 3.0
     assert ImportOptions(max_gap=2.0).max_gap == 2.0
+
+
+def test_a_rudder_in_degrees_is_no_wrapped_angle(tmp_path):
+    """An import without a fix keeps its numbers, and a fit refuses them."""
+    vessel = vessel_from_dict({
+        "name": "boat", "length": 12.0,
+        "thruster": [{"type": "propeller_rudder", "x": -5.0, "speed": "n", "rudder": "delta"}],
+    })  # fmt: skip
+    data = {k: v for k, v in columns().items() if k in ("t", "x_n", "y_n", "psi", "u", "v", "r")}
+    rudder = np.repeat([0.0, 10.0, 35.0, -20.0], 100)
+    data |= {"n": np.full(400, 5.0), "delta": rudder}
+    (log,) = import_recording(as_recording(data), vessel, ImportOptions()).segments
+    assert np.array_equal(log["delta"], rudder)
+    with pytest.raises(LogError, match=r"'delta' of 'x.csv' reaches 35, above the 1.57 rad"):
+        read_segments(to_csv(data, tmp_path / "x.csv"), vessel)

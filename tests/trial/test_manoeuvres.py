@@ -647,3 +647,13 @@ def test_random_and_berthing_logs_hold_no_manoeuvre(data_folder):
     for kind in ("random", "berthing"):
         for path in sorted((data_folder / "esso_osaka").glob(f"{kind}_*.csv")):
             assert find_manoeuvres(esso(path)) == (), path.name
+
+
+def test_a_short_swing_is_no_constant():
+    """A quick boat reaches the heading of its second execute within three samples."""
+    t = np.arange(4.0)
+    psi = 2.5 * t**2
+    exact = fit_at(t, psi, 2.0, 2.0, std=0.0, side="before", bounds=(0.0, 2.0))
+    assert exact.value(2.0) == pytest.approx(10.0, abs=1e-9)
+    measured = fit_at(t, 5 * t, 2.0, 2.0, side="before", bounds=(0.0, 2.0))
+    assert measured.value(2.0) == pytest.approx(10.0, abs=1e-9)

@@ -6,6 +6,7 @@ import contextlib
 import datetime
 import pickle
 import zipfile
+from time import process_time
 
 import numpy as np
 import pandas as pd
@@ -233,7 +234,7 @@ def test_thousands_of_columns(tmp_path):
 def test_columns_of_one_name(tmp_path):
     _, table = read(written(tmp_path / "x.csv", "t,u,u,u,u.2\n1,2,3,4,5\n2,3,4,5,6\n"))
     assert len(set(table.columns)) == 5
-    assert "column 'u' stands 3 times: it is called 'u.3' there" in table.notes
+    assert "3 columns are called 'u': the last is taken as 'u.3'" in table.notes
 
 
 def test_columns_may_stand_in_any_order(tmp_path):
@@ -279,7 +280,7 @@ def bad_csv():
     yield "control", b"\x01\x02\x03\x04abc\n" * 50, "control characters"
     yield "ambiguous", b"t,u\n" + b"1,5,2,5\n" * 9, "2 names in its header and 4 fields"
     yield "words", b"t,u\n" + b"one,two\n" * 9, "no rows|holds words"
-    yield "dates", b"time,u\n" + b"5/1/24 3:00 PM,2\n" * 9, "holds words where the time"
+    yield "dates", b"time,u\n" + b"5/1/24 3:00 PM,2\n" * 9, "holds '5/1/24 3:00 PM' where the time"
     yield "no time", b"u,v\n" + b"1,2\n" * 9, "no column 't'"
     yield "long line", b"t,u\n1,2\n" + b"7" * (1 << 23) * 3, "no column|cannot read|hold"
     yield "narrow", b"t,u,v\n1,2,3\n" + b"1,2,3\n" * 80 + b"1,2\n" * 500, "500 of 581 rows"
@@ -552,3 +553,12 @@ def test_damaged_numbers_in_columns_called_n_and_e_are_no_positions(tmp_path):
         {"name": "S", "length": 5, "thruster": [{"type": "fixed", "speed": "rps"}]}
     )
     assert not {"x_n", "y_n"} & set(read_recording(path, ship).names)
+
+
+def test_a_number_of_a_million_digits_is_read_in_time(tmp_path):
+    """Its digits are looked at once, whatever follows them."""
+    start = process_time()
+    assert not cells.is_number("9" * 10**6 + ",1;2", comma=True)
+    assert process_time() - start < 1.0
+    rows = b"t,u\n" + b"".join(b"%d,2\n" % k for k in range(9)) + b"9" * 10**6 + b",2\n"
+    assert len(read(written(tmp_path / "x.csv", rows))[0]["u"]) == 10

@@ -255,4 +255,4 @@ def test_what_a_check_mended_is_kept_as_steps(tmp_path):
     (step,) = (s for s in log.provenance.steps if s.operation == "drop")
     assert (step.channels, step.decided_by, step.parameters["times"]) == (("v",), "check", (4.0,))
     assert log.provenance.fixed == (step.sentence,)
-    assert "stands out of the neighbours" in step.reason
+    assert "stands out from its neighbours" in step.reason

@@ -40,12 +40,12 @@ def _fit(problem: EstimationProblem) -> Fitted:
         if problem.kind.air_measured:
             notes.append(
                 f"the wind in the instruments is the measured one averaged over {WIND_WINDOW:g} s, "
-                f"because its sensor is noisy; terms that only faster gusts could tell stay "
-                f"uncertain."
+                f"because its sensor is noisy; terms that only faster gusts would "
+                f"determine stay uncertain."
                 if wind == "smoothed"
-                else "the instruments hold the measured wind as it is: noise of its sensor would "
-                "move the wind terms towards zero and, in a nearly steady wind, the current with "
-                "them. Give wind_std in [sensors] where there is some; the wind is then averaged."
+                else "the instruments hold the measured wind as it is: if its sensor is noisy, the "
+                "wind terms are biased towards zero and, in a nearly steady wind, the current with "
+                "them. State wind_std in [sensors], and the wind is averaged."
             )
         return Fitted(estimate, solved.problem, white=white)
 

@@ -33,11 +33,11 @@ def _fit(problem: EstimationProblem) -> Fitted:
     if problem.covariance is not None:
         options = replace(options, covariance=problem.covariance, seed=problem.seed)
     start = problem.nominal_theta if problem.start is None else problem.start
-    notes = ["it started from the nominal model."]
+    notes = ["the fit started from a model that was given, or found by an earlier step."]
     if problem.nominal_theta is not None:
         start = problem.nominal_theta
     elif problem.start is not None:
-        notes = [f"it started from the estimate by {problem.start.method}."]
+        notes = [f"the fit started from the estimate by {problem.start.method}."]
     else:
         start, said = _quick_start(problem)
         notes = [said]
@@ -67,13 +67,15 @@ def _quick_start(problem: EstimationProblem) -> tuple[Estimate | None, str]:
     regression = RegressionProblem(predictor, problem.logs)
     try:
         found = solve_iv(regression, refine=_STARTING_REFINEMENTS).estimate("white")
-        return found, "it started from an estimate by instrumental variables."
+        return found, "the fit started from an estimate by instrumental variables."
     except (ExcitationError, DivergenceError):
         pass
     try:
-        return solve_ls(regression).estimate("white"), "it started from the least-squares estimate."
+        return solve_ls(regression).estimate(
+            "white"
+        ), "the fit started from the least-squares estimate."
     except ExcitationError:
-        return None, "it had no estimate to start from."
+        return None, "the fit had no estimate to start from."
 
 
 ENTRY = Estimator(

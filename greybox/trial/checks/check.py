@@ -111,8 +111,8 @@ def require_each_once(paths: Sequence[str | Path]) -> None:
     twice = next((p for p in places if places.count(p) > 1), None)
     if twice is not None:
         raise UsageError(
-            f"'{twice.name}' is named {places.count(twice)} times and would count as as many "
-            f"logs: name each log once."
+            f"'{twice.name}' is named {places.count(twice)} times and would count as "
+            f"{places.count(twice)} logs: name each log once."
         )
 
 

@@ -52,7 +52,7 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
     mean = complex(unit.mean())
     angle = float(np.angle(mean))
     spread = float(np.ptp(psi[under_way]))
-    sentence = f"{vague}: a bias and a drift angle of {np.degrees(angle):.0f} deg look alike"
+    sentence = f"{vague}: a bias cannot be told from a drift angle of {np.degrees(angle):.0f} deg"
     astern = abs(abs(angle) - np.pi) < _PLAUSIBLE
     if abs(mean) < _LEAST_SHARE or abs(angle) < _PLAUSIBLE or astern or spread < _LEAST_TURN:
         return [], [Outcome("heading_bias", "cannot tell", sentence)]

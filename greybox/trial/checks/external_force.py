@@ -148,8 +148,8 @@ def force_findings(
     half, spread = scan.half_thrust()
     if half < _KNOWN * spread:
         vague = (
-            f"the thrust that half of the top speed needs is known to {100 * spread / half:.0f} % "
-            f"only, at most {100 / _KNOWN:.0f} % are needed: add logs with changes of thrust"
+            f"the thrust for half of the top speed is uncertain by {100 * spread / half:.0f} %, "
+            f"at most {100 / _KNOWN:.0f} % are allowed: add logs with changes of thrust"
         )
         untold = Outcome("external_force", "cannot tell", vague)
         return found, [t or untold for t in told]

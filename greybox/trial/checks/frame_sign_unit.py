@@ -142,7 +142,7 @@ _PSI = (
     ),
     ColumnHypothesis(
         "unit", "psi", ("psi",), _degrees, (mend("scale", ("psi",), factor=_DEG),),
-        "psi holds degrees under a radian name",
+        "psi holds degrees where a log has radians",
         declare_unit(("psi",), "deg"), 180 / np.pi, "deg per rad",
     ),
     ColumnHypothesis(
@@ -340,7 +340,7 @@ def reading_findings(reading: ColumnReading, names: Sequence[str] = ()) -> list[
                 c.value,
                 (c.value, c.value),
                 c.unit,
-                f"{c.words}: only so do {tied} agree (log-likelihood higher by "
+                f"{c.words}: only then do {tied} agree (log-likelihood higher by "
                 f"{reading.gain:.0f}{beside}){doubt}",
                 c.fix,
                 c.channels,

@@ -11,6 +11,7 @@ from greybox.channels import ANGLES
 from greybox.numerics.robust import FROM_MEDIAN, robust_deviation
 from greybox.rotation import body_to_ned
 from greybox.trial.checks.finding import Finding, declare_unit
+from greybox.trial.convert.channel_mapping import beyond_reach
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, runs
 from greybox.trial.gaps import GAP, HOLE, usual_step
@@ -59,8 +60,12 @@ def time_findings(recording: Recording) -> list[Finding]:
         if repeated or back:
             count = repeated + back
             k = int(np.flatnonzero(steps <= 0)[0])
-            what = [f"{repeated} repeat the one before"] if repeated else []
-            what += [f"{back} go back"] if back else []
+            what = (
+                [f"{repeated} repeat{'' if repeated > 1 else 's'} the one before"]
+                if repeated
+                else []
+            )
+            what += [f"{back} go{'' if back > 1 else 'es'} back"] if back else []
             found.append(
                 Finding(
                     "duplicate_time",
@@ -68,8 +73,8 @@ def time_findings(recording: Recording) -> list[Finding]:
                     float(count),
                     (float(count), float(count)),
                     "1",
-                    f"of {len(finite)} times of {listed(names)}, {' and '.join(what)}, the first "
-                    f"after t = {finite[k]:.6g} s",
+                    f"of the {len(finite)} times of {listed(names)} {' and '.join(what)}, the "
+                    f"first after t = {finite[k]:.6g} s",
                     "sort the rows by time and keep the first of those that repeat "
                     "(import --fix does)",
                     ("t",),
@@ -196,8 +201,8 @@ def spike_findings(recording: Recording) -> list[Finding]:
                 (size - half, size + half),
                 s.unit or "1",
                 f"{len(spikes)} sample{'s' if len(spikes) > 1 else ''} of {s.name} "
-                f"stand{'' if len(spikes) > 1 else 's'} out of the neighbours, the "
-                f"largest by {size:.3g} {s.unit} at t = {t[worst]:.6g} s, "
+                f"{'stand out from their' if len(spikes) > 1 else 'stands out from its'} "
+                f"neighbours, the largest by {size:.3g} {s.unit} at t = {t[worst]:.6g} s, "
                 f"where the neighbours scatter by {scale:.2g}",
                 "leave those samples out (import --fix does; what is missing is bridged where "
                 "one sample is, else a gap)",
@@ -510,18 +515,11 @@ def _moves(name: str, start: float, stop: float, signals: list[Signal], step: fl
 def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
     """Find degrees under a radian name by range: angles of wind and thrusters."""
     found = []
-    moved = [m for t in vessel.thrusters for m in t.movements]
-    rudders = {c for kind, *both, _ in moved if kind == "rudder" for c in both}
     for s in recording.signals:
         if s.name not in (ANGLES | vessel.recorded_angles) - {"psi", "cog"}:
             continue
-        _, value = clean(s)
-        if len(value) < 3:
-            continue
-        largest = float(np.quantile(np.abs(value), 0.98))
-        # no rudder passes a right angle, no wrapped angle two turns
-        limit = np.pi / 2 if s.name in rudders else 4 * np.pi
-        if largest > limit:
+        if beyond := beyond_reach(s, vessel):
+            largest, limit = beyond
             factor = float(np.pi / 180)
             found.append(
                 Finding(
@@ -531,7 +529,7 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
                     (180 / np.pi, 180 / np.pi),
                     "deg per rad",
                     f"{s.name} reaches {largest:.4g}, above the {limit:.3g} rad that it can "
-                    f"reach: it holds degrees under a radian name",
+                    f"reach: it holds degrees where a log has radians",
                     declare_unit((s.name,), "deg"),
                     (s.name,),
                     (mend("scale", (s.name,), factor=factor),),

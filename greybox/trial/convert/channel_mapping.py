@@ -228,15 +228,18 @@ def table_columns(
     assigned = {n: a for n, a in assigned.items() if not own & set(parts.get(a.raw, ()))}
     if "t" not in assigned:
         advice = "Map" if guess else "Make a log of the file with greybox import, or map"
+        timed = (c for c in table.columns if c in table.dates | table.clocks or "time" in c.lower())
+        likely = next(timed, "tvec")
         raise LogError(
             f"'{table.path.name}' has no column 't'.{suggestion('t', table.columns)} "
-            f"{advice} the time column in the vessel file's [columns] with its unit. "
-            f"Its columns: {', '.join(table.columns[:30])}."
+            f'{advice} the time column in the vessel file\'s [columns], such as "{likely}" = '
+            f'{{ name = "t", unit = "s" }}. Its columns: {", ".join(table.columns[:30])}.'
         )
     time = assigned["t"].raw
     if time in table.text:
+        word = read_columns(table, [time])[time][0]
         raise LogError(
-            f"column '{time}' of '{table.path.name}' holds words where the time should be: "
+            f"column '{time}' of '{table.path.name}' holds '{word}' where the time should be: "
             f"write seconds, UNIX time or ISO 8601 (2024-05-01T12:00:00Z), or map another column "
             f"to 't' in [columns]."
         )
@@ -393,6 +396,18 @@ def angle_unit(reach: tuple[float, float]) -> str:
     """Return the unit of an angle, from `angle_reach`."""
     # wrapped radians end at 2π; what turns further was unwrapped, and then has no jumps
     return "deg" if reach[0] > 50 or reach[1] > 100 else "rad"
+
+
+def beyond_reach(signal: Signal, vessel: Vessel) -> tuple[float, float] | None:
+    """Return how far an angle reaches and how far it can [rad], where it is beyond."""
+    finite = np.abs(signal.value[np.isfinite(signal.value)])
+    if len(finite) < 3:
+        return None
+    # single glitches tell nothing of the unit
+    largest = float(np.quantile(finite, 0.98))
+    # no rudder passes a right angle, no wrapped angle two turns
+    limit = np.pi / 2 if signal.name in vessel.rudders else 4 * np.pi
+    return (largest, limit) if largest > limit else None
 
 
 def _guess_commands(raw: Recording, assigned: dict[str, Assigned], vessel: Vessel) -> None:

@@ -20,8 +20,8 @@ _QUALIFIERS = {
 _GUESSES: dict[str, tuple[str, ...]] = {
     "t": ("header_stamp", "t", "time", "times", "timestamp", "t_rel", "elapsed", "elapsed_time",
           "seconds", "original_timestamp", "unix", "unix_time", "unix_utc", "utc", "datetime",
-          "date_time", "epoch", "gps_time", "time_unix", "utc_time", "time_utc", "uhrzeit", "stamp",
-          "zeit", "tid", "clock"),
+          "date_time", "epoch", "gps_time", "time_unix", "utc_time", "time_utc", "time_stamp",
+          "local_time", "time_local", "uhrzeit", "stamp", "zeit", "tid", "clock"),
     "psi": ("psi", "heading", "hdg", "true_heading", "heading_true", "yaw", "yaw_angle", "head",
             "hdt"),
     "x_n": ("x_n", "x_ned", "north", "northing", "pos_n", "pos_north", "position_north",

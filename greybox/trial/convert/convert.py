@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.notebook import DisplayMixin, items, table
 from greybox.trial.convert.deduplicate import clean_signals
-from greybox.trial.convert.derived_signals import complete_channels
+from greybox.trial.convert.derived_signals import complete_channels, continuous
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.resample import (
     AVERAGED,
@@ -315,8 +315,8 @@ def _resample(
     commands = set(vessel.recorded_columns)
     for s in recording.signals:
         name, of, value = s.name, clocks[s.name], s.value
-        if name in vessel.recorded_angles:
-            value = np.unwrap(value)
+        if name in vessel.recorded_angles - vessel.rudders:
+            value = continuous(value)
         if len(s.t) == len(grid) and np.abs(s.t - grid).max() < 0.01 * sample_time:
             channels[name] = np.asarray(value, float)
             continue

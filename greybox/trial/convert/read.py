@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.channel_mapping import (
+    beyond_reach,
     canonical,
     possible,
     table_columns,
@@ -204,6 +205,13 @@ def _clean_recording(
     sample_time = _require_uniform(scale.seconds(batch[time.raw]), rows, table, notes)
     raw = whole_recording(table, batch, assigned, scale, vessel)
     recording = replace(canonical(raw, assigned, vessel), steps=(*known.steps, *raw.steps))
+    for rudder in (s for s in recording.signals if s.name in vessel.rudders):
+        if beyond := beyond_reach(rudder, vessel):
+            raise LogError(
+                f"'{rudder.name}' of '{table.path.name}' reaches {beyond[0]:.4g}, above the "
+                f"{beyond[1]:.3g} rad of a right angle: it holds degrees. Convert it to radians, "
+                f"or import the raw file with greybox import --fix."
+            )
     return clean_signals(recording), sample_time, notes
 
 

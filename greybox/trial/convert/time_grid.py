@@ -230,8 +230,14 @@ def _usable(
     inputs = [c for c in vessel.commands if c in used]
     if not motion and not inputs:
         raise LogError(
-            f"'{name}' has no position, heading, velocity or thruster column with values among "
-            f"{', '.join(extents) or 'nothing'}: map its columns in the vessel file."
+            f"'{name}' has no position, heading, velocity or thruster column with "
+            f"{MIN_SEGMENT} values or more"
+            + (
+                f"; it has {', '.join(f'{n} ({e.count})' for n, e in extents.items())}"
+                if extents
+                else ""
+            )
+            + ". Map its columns in the vessel file, or use a longer log."
         )
     missing = [c for c in vessel.commands if c not in used]
     if missing:

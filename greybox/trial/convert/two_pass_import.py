@@ -38,7 +38,7 @@ from greybox.trial.convert.convert import (
     make_provenance,
 )
 from greybox.trial.convert.deduplicate import clean_signals
-from greybox.trial.convert.derived_signals import derive_signals
+from greybox.trial.convert.derived_signals import continuous, derive_signals
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.resample import clock
 from greybox.trial.convert.time_grid import Extent, Plan, extent, gap_notes, plan_import
@@ -447,12 +447,12 @@ class Stream:
         """Unwrap angles as if the blocks before were there; `start` is where the next begins."""
         out = []
         for s in recording.signals:
-            if s.name in {"psi", *self.vessel.recorded_angles}:
+            if s.name in {"psi", *self.vessel.recorded_angles} - self.vessel.rudders:
                 order = np.argsort(s.t, kind="stable")
                 rows = order[np.isfinite(s.value[order]) & np.isfinite(s.t[order])]
                 if len(rows):
                     value = s.value.copy()
-                    value[rows] = np.unwrap(value[rows])
+                    value[rows] = continuous(value[rows])
                     if s.name in self.anchors:
                         turns = np.round((self.anchors[s.name] - value[rows[0]]) / (2 * np.pi))
                         value += 2 * np.pi * turns

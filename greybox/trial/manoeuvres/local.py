@@ -205,7 +205,10 @@ def fit_at(
             break
         best = wider
     x, z = t[best] - at, y[best]
-    degree = min(3 if side != "both" else 4, max(0, len(best) - 3))
+    # two samples are kept to tell the noise, of which a simulated signal has none; what turns
+    # is a line at least, since a constant is off by half of what it turns in the window
+    spare, least = (1, 0) if std == 0 else (3, int(len(best) > 2))
+    degree = min(3 if side != "both" else 4, max(least, len(best) - spare))
     design = np.vander(x, degree + 1, increasing=True)
     coefficients, covariance, dof, noise = regress(design, z, std)
     return LocalFit(

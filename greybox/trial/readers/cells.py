@@ -21,7 +21,7 @@ DAY = 86400.0
 _NOTHING = {n.lower() for n in NULLS} | {"inf", "-inf", "+inf"}
 # a dash is how people fill a cell of any row, also of a row of units
 _BLANK = {"", "-", "--"}
-_POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
+_POINT = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eEdD][+-]?\d+)?")
 _COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eEdD][+-]?\d+)?")
 # points between thousands, before a decimal comma
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")

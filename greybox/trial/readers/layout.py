@@ -309,12 +309,12 @@ def _unique(names: list[str], notes: list[str]) -> tuple[str, ...]:
             count += 1
             new = f"{name}.{count}"
         if new != name:
-            renamed.append(f"column '{name}' stands {count} times: it is called '{new}' there")
+            renamed.append(f"{count} columns are called '{name}': the last is taken as '{new}'")
         taken.add(new)
         found.append(new)
     notes += renamed[:_MAX_NOTED]
     if len(renamed) > _MAX_NOTED:
-        notes.append(f"{len(renamed) - _MAX_NOTED} more columns stand more than once")
+        notes.append(f"{len(renamed) - _MAX_NOTED} more columns have the name of another")
     return tuple(found)
 
 
