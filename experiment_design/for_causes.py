@@ -394,7 +394,7 @@ def design_for_causes(
             )
         ]
 
-    tightened, searches, keeping = tightened_search(request, campaign)
+    tightened, searches, keeping = tightened_search(request, found.misled, campaign)
     design = described_plan(
         request, tightened, searches, keeping, kept_starts=int(kept_start), began=began,
         certificate="a plan for causes has no bound to be measured against",

@@ -17,14 +17,15 @@ from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.checks import require_horizon
 from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
+    Misfit,
     keep_probability,
 )
 from experiment_design.information.envelope import Envelope, build_envelope
 from experiment_design.optimise.campaign import random_campaign
 from experiment_design.optimise.envelope_search import (
-    VALIDATION,
     EnvelopeSearch,
     search_envelope,
+    usual_ends,
 )
 from experiment_design.optimise.lead_in import after_lead_in
 from experiment_design.output.result import Design, PlanPart
@@ -33,8 +34,7 @@ from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
-from greybox.trial.plan_parts import LEAD_IN, TRIAL
-from greybox.trial.plan_parts import VALIDATION as VALIDATION_PART
+from greybox.trial.plan_parts import LEAD_IN, TRIAL, VALIDATION
 
 Array = NDArray[np.float64]
 
@@ -88,11 +88,18 @@ class PredictionDesign:
                 "error_by_misfit": self.misfit,
                 "random_error_over_this": self.random,
                 "envelope": {n: list(r) for n, r in self.commands.items()},
-                "validation_share": VALIDATION,
+                "validation_share": self.validation_share,
                 "crossings": [list(c) for c in self.crossings],
                 "prior": self.level,
             },
         }
+
+    @property
+    def validation_share(self) -> float:
+        """Share of the first trial, lead-in included, that is its validation."""
+        return sum(
+            self.design.share(p) for p in self.design.parts if p.name == VALIDATION and not p.trial
+        )
 
     def headline(self) -> str:
         """Return in one sentence what the plan is for and what is expected of it."""
@@ -126,8 +133,8 @@ class PredictionDesign:
             f"{r.duration:g} s for prediction, both sides, {ranges}",
             *(["planned without an estimated model, from main dimensions"] if r.untried else []),
             self.headline(),
-            f"the last {VALIDATION:.0%} of each trial may judge an estimate that takes no part in "
-            f"it (--plan of greybox estimate)",
+            f"the last {self.validation_share:.0%} of each trial, a usual zig-zag or turn, judges "
+            f"an estimate of the rest, then joins it (--plan of greybox estimate)",
         ]
         if self.crossings:
             part = sum(b - a for a, b in self.crossings) / r.duration
@@ -299,13 +306,14 @@ def _design(
         asked = after_lead_in(asked)
     before = log_moments(found, sailed)
     tightened, searches, keeping = tightened_search(
-        asked, lambda r: _campaign(r, found, before, workers)
+        asked, found.misled, lambda r: _campaign(r, found, before, workers)
     )
     design = described_plan(
         asked, tightened, searches, keeping, kept_starts=kept_starts, began=began,
         certificate="a plan for prediction has no bound to be measured against",
     )  # fmt: skip
-    design = replace(design, parts=_parts(asked, design.parts))
+    ended = usual_ends(found, asked.schedule.holds, asked.hold).shape[1]
+    design = replace(design, parts=_parts(asked, design.parts, ended))
     known = _sum(before, log_moments(found, design.motions[1:]))
     noise, unknown = found.errors(design.motions[0], known)
     kept = searches[0].random[np.isfinite(searches[0].random)]
@@ -335,15 +343,14 @@ def _of_start(start: str, kept: int, trials: int) -> tuple[str, ...]:
     return (f"{which} from a steady motion: {start} (--start to change)",)
 
 
-def _parts(request: PreparedRequest, led: tuple[PlanPart, ...]) -> tuple[PlanPart, ...]:
-    """Return what leads in, what is sailed for the estimate, and the part that may judge it."""
-    holds = request.schedule.holds
+def _parts(request: PreparedRequest, led: tuple[PlanPart, ...], ended: int) -> tuple[PlanPart, ...]:
+    """Return what leads in, what is searched for, and the last holds, by which it is judged."""
     first = 0.0 if request.lead_in is None else request.lead_in.seconds
-    begin = first + (holds - round(VALIDATION * holds)) * request.hold
+    begin = first + (request.schedule.holds - ended) * request.hold
     last = first + request.duration
     if begin >= last:
         return led
-    spans = ((TRIAL, first, begin), (VALIDATION_PART, begin, last))
+    spans = ((TRIAL, first, begin), (VALIDATION, begin, last))
     return (
         *(part for part in led if part.name == LEAD_IN),
         *(PlanPart(name, t, a, b) for t in range(request.trials) for name, a, b in spans),
@@ -415,13 +422,17 @@ def described_plan(
 
 
 def tightened_search(
-    request: PreparedRequest, campaign: Callable[[PreparedRequest], list[EnvelopeSearch]]
+    request: PreparedRequest,
+    misfit: Misfit,
+    campaign: Callable[[PreparedRequest], list[EnvelopeSearch]],
 ) -> tuple[PreparedRequest, list[EnvelopeSearch], ConstraintSatisfaction | None]:
     """Search all trials, with limits tightened until they are kept with the wanted probability.
 
     Parameters
     ----------
     request : PreparedRequest
+    misfit : callable
+        See `keep_probability`.
     campaign : callable
         Searches the trials of a request.
 
@@ -434,7 +445,7 @@ def tightened_search(
     if not request.uncertain:
         return request, searches, None
     plain = request
-    keeping = keep_probability(plain, [s.candidate.unit for s in searches])
+    keeping = keep_probability(plain, [s.candidate.unit for s in searches], misfit=misfit)
     best = (request, searches, keeping)
     backoff, shortfall = np.zeros(len(keeping.shortfall)), keeping.shortfall
     for _ in range(_TIGHTENINGS):
@@ -443,7 +454,7 @@ def tightened_search(
         backoff = backoff + 1.1 * shortfall
         tighter = replace(plain, backoff=tuple(backoff))
         again = campaign(tighter)
-        now = keep_probability(plain, [s.candidate.unit for s in again])
+        now = keep_probability(plain, [s.candidate.unit for s in again], misfit=misfit)
         shortfall = now.shortfall
         if now.probability > best[2].probability:
             best = (tighter, again, now)

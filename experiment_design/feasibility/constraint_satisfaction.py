@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.constraints.kinds.margin import Margin
-from experiment_design.excitation.rollout import Rollout
+from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.request.request import PreparedRequest
 from greybox.numerics.binomial import wilson_interval
 
 Array = NDArray[np.float64]
+
+# by how much so many draws of forces that the prior does not say move a run, (D, N+1, nx)
+Misfit = Callable[[Motion, int], Array]
 
 _DRAWS = 400
 
@@ -33,6 +37,8 @@ class ConstraintSatisfaction:
         (m,) by how much each path limit is missed at the wanted quantile, in its unit.
     margins : dict of str to float
         The margins that are kept with the wanted probability.
+    misled : bool
+        Whether forces that the prior's misfit leaves open moved them too.
     """
 
     probability: float
@@ -41,12 +47,15 @@ class ConstraintSatisfaction:
     draws: int
     shortfall: Array
     margins: dict[str, float]
+    misled: bool = False
 
     def sentence(self) -> str:
         """Return one sentence for the summary."""
         return (
             f"limits are kept with probability {self.probability:.2f} "
             f"({self.lower:.2f} to {self.upper:.2f}) under {self.draws} models drawn from the prior"
+            + " and its misfit"
+            * self.misled
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -59,7 +68,10 @@ class ConstraintSatisfaction:
 
 
 def keep_probability(
-    request: PreparedRequest, units: list[Array], draws: int = _DRAWS
+    request: PreparedRequest,
+    units: list[Array],
+    draws: int = _DRAWS,
+    misfit: Misfit | None = None,
 ) -> ConstraintSatisfaction:
     """Run the plan under models drawn from the prior and count which keep every limit.
 
@@ -72,6 +84,8 @@ def keep_probability(
     units : list of ndarray
         (K, nc) unit coordinates a trial.
     draws : int
+    misfit : callable, optional
+        Moves each draw by forces that the prior's terms do not say.
     """
     since, own = request.lead_in_samples, request.schedule
     levels = [request.with_lead_in(own.lower + (own.upper - own.lower) * u) for u in units]
@@ -89,6 +103,8 @@ def keep_probability(
         )  # fmt: skip
         program = plain.limit_program(nominal, t)
         motion = nominal.run_models(thetas, c, late=True)
+        if misfit is not None:
+            motion = nominal.moved(motion, misfit(nominal.run(c[None]), draws))
         over = program.worst(motion.state, since)
         over[:, ~motion.stable] = np.inf
         kept &= (over <= 1e-3).all(axis=0) & motion.stable
@@ -104,8 +120,9 @@ def keep_probability(
         if isinstance(limit, Margin):
             margins[limit.state] = limit.bound - _quantile(w, request.probability, np.inf)
     return ConstraintSatisfaction(
-        hits / draws, low, high, draws, np.maximum(shortfall, 0.0), margins
-    )
+        hits / draws, low, high, draws, np.maximum(shortfall, 0.0), margins,
+        misfit is not None,
+    )  # fmt: skip
 
 
 def _quantile(values: Array, share: float, otherwise: float) -> float:
