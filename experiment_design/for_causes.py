@@ -367,6 +367,7 @@ def design_for_causes(
     require_horizon(request)
     causes, tried, notes = open_causes(request, model, asked)
     found, _ = operating_envelope(request, model, envelope or {})
+    request = replace(request, misfit=found.misled)
     if not kept_start:
         request = replace(request, starts=(found.rollout.start,))
     problem = build_problem(request)
@@ -394,7 +395,7 @@ def design_for_causes(
             )
         ]
 
-    tightened, searches, keeping = tightened_search(request, found.misled, campaign)
+    tightened, searches, keeping = tightened_search(request, campaign)
     design = described_plan(
         request, tightened, searches, keeping, kept_starts=int(kept_start), began=began,
         certificate="a plan for causes has no bound to be measured against",

@@ -17,8 +17,7 @@ from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.checks import require_horizon
 from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
-    Misfit,
-    keep_probability,
+    tighten,
 )
 from experiment_design.information.envelope import Envelope, build_envelope
 from experiment_design.optimise.campaign import random_campaign
@@ -301,12 +300,13 @@ def _design(
     found, level = operating_envelope(request, model, given)
     states = request.structure.states
     others = (found.rollout.start,) * request.trials
-    asked = replace(request, starts=(*request.starts[:kept_starts], *others[kept_starts:]))
+    starts = (*request.starts[:kept_starts], *others[kept_starts:])
+    asked = replace(request, starts=starts, misfit=found.misled)
     if kept_starts:
         asked = after_lead_in(asked)
     before = log_moments(found, sailed)
     tightened, searches, keeping = tightened_search(
-        asked, found.misled, lambda r: _campaign(r, found, before, workers)
+        asked, lambda r: _campaign(r, found, before, workers)
     )
     design = described_plan(
         asked, tightened, searches, keeping, kept_starts=kept_starts, began=began,
@@ -314,7 +314,7 @@ def _design(
     )  # fmt: skip
     ended = usual_ends(found, asked.schedule.holds, asked.hold).shape[1]
     design = replace(design, parts=_parts(asked, design.parts, ended))
-    known = _sum(before, log_moments(found, design.motions[1:]))
+    known = before + log_moments(found, design.motions[1:])
     noise, unknown = found.errors(design.motions[0], known)
     kept = searches[0].random[np.isfinite(searches[0].random)]
     usual = float(np.median(np.exp(-kept))) if len(kept) else float("nan")
@@ -355,12 +355,6 @@ def _parts(request: PreparedRequest, led: tuple[PlanPart, ...], ended: int) -> t
         *(part for part in led if part.name == LEAD_IN),
         *(PlanPart(name, t, a, b) for t in range(request.trials) for name, a, b in spans),
     )
-
-
-def _sum(first: Array | None, second: Array | None) -> Array | None:
-    if first is None or second is None:
-        return second if first is None else first
-    return first + second
 
 
 def described_plan(
@@ -422,17 +416,13 @@ def described_plan(
 
 
 def tightened_search(
-    request: PreparedRequest,
-    misfit: Misfit,
-    campaign: Callable[[PreparedRequest], list[EnvelopeSearch]],
+    request: PreparedRequest, campaign: Callable[[PreparedRequest], list[EnvelopeSearch]]
 ) -> tuple[PreparedRequest, list[EnvelopeSearch], ConstraintSatisfaction | None]:
     """Search all trials, with limits tightened until they are kept with the wanted probability.
 
     Parameters
     ----------
     request : PreparedRequest
-    misfit : callable
-        See `keep_probability`.
     campaign : callable
         Searches the trials of a request.
 
@@ -444,25 +434,14 @@ def tightened_search(
     searches = campaign(request)
     if not request.uncertain:
         return request, searches, None
-    plain = request
-    keeping = keep_probability(plain, [s.candidate.unit for s in searches], misfit=misfit)
-    best = (request, searches, keeping)
-    backoff, shortfall = np.zeros(len(keeping.shortfall)), keeping.shortfall
-    for _ in range(_TIGHTENINGS):
-        if best[2].probability >= request.probability or not shortfall.any():
-            break
-        backoff = backoff + 1.1 * shortfall
-        tighter = replace(plain, backoff=tuple(backoff))
-        again = campaign(tighter)
-        now = keep_probability(plain, [s.candidate.unit for s in again], misfit=misfit)
-        shortfall = now.shortfall
-        if now.probability > best[2].probability:
-            best = (tighter, again, now)
-    return best
+    return tighten(
+        request, searches, lambda tighter, _: campaign(tighter),
+        lambda found: [s.candidate.unit for s in found], _TIGHTENINGS,
+    )  # fmt: skip
 
 
 def _campaign(
-    request: PreparedRequest, envelope: Envelope, before: Array | None, workers: int | None
+    request: PreparedRequest, envelope: Envelope, before: Array | float, workers: int | None
 ) -> list[EnvelopeSearch]:
     found: list[EnvelopeSearch] = []
     known = before
@@ -473,9 +452,8 @@ def _campaign(
         )
         found.append(search)
         commands = problem.schedule.expand(problem.levels(search.candidate.unit))
-        known = _sum(
-            known, envelope.information(problem.scenarios[0].rollout.run(commands[None]))[0]
-        )
+        motion = problem.scenarios[0].rollout.run(commands[None])
+        known = known + envelope.information(motion)[0]
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
@@ -44,6 +45,10 @@ class Motion:
     tau: Array
     commands: Array
     stable: NDArray[np.bool_]
+
+
+# by how much so many draws of forces that a prior does not say move a run, (D, N+1, nx)
+Misfit = Callable[[Motion, int], Array]
 
 
 class Rollout:
@@ -148,13 +153,17 @@ class Rollout:
 
     def moved(self, motion: Motion, by: Array) -> Motion:
         """Return R runs whose states are off (R, N+1, nx), heading and place as they follow."""
-        x, psi = motion.state[..., : self.nx] + by, motion.state[..., self.nx]
-        if "r" in self.structure.states:
-            turned = np.cumsum(by[:, :-1, self.structure.states.index("r")], axis=1)
-            psi = psi + self.sample_time * np.pad(turned, ((0, 0), (1, 0)))
+        x, psi = self.off(motion.state[..., : self.nx], motion.state[..., self.nx], by)
         state = self._with_way(x, psi)
         state[~motion.stable] = 0.0
         return Motion(state, motion.tau, motion.commands, motion.stable)
+
+    def off(self, x: Array, psi: Array, by: Array) -> tuple[Array, Array]:
+        """Return states (R, N+1, nx) and headings (R, N+1) that are off by so much (R, N+1, nx)."""
+        if "r" in self.structure.states:
+            turned = np.cumsum(by[:, :-1, self.structure.states.index("r")], axis=1)
+            psi = psi + self.sample_time * np.pad(turned, ((0, 0), (1, 0)))
+        return x + by, psi
 
     def _with_way(self, x: Array, psi: Array) -> Array:
         """Return states (R, N+1, nx), heading (R, N+1) and the place that they lead to."""

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.constraints.kinds.margin import Margin
-from experiment_design.excitation.rollout import Motion, Rollout
+from experiment_design.excitation.rollout import Rollout
 from experiment_design.request.request import PreparedRequest
 from greybox.numerics.binomial import wilson_interval
 
 Array = NDArray[np.float64]
 
-# by how much so many draws of forces that the prior does not say move a run, (D, N+1, nx)
-Misfit = Callable[[Motion, int], Array]
+Found = TypeVar("Found")
 
 _DRAWS = 400
 
@@ -68,10 +67,7 @@ class ConstraintSatisfaction:
 
 
 def keep_probability(
-    request: PreparedRequest,
-    units: list[Array],
-    draws: int = _DRAWS,
-    misfit: Misfit | None = None,
+    request: PreparedRequest, units: list[Array], draws: int = _DRAWS
 ) -> ConstraintSatisfaction:
     """Run the plan under models drawn from the prior and count which keep every limit.
 
@@ -84,8 +80,6 @@ def keep_probability(
     units : list of ndarray
         (K, nc) unit coordinates a trial.
     draws : int
-    misfit : callable, optional
-        Moves each draw by forces that the prior's terms do not say.
     """
     since, own = request.lead_in_samples, request.schedule
     levels = [request.with_lead_in(own.lower + (own.upper - own.lower) * u) for u in units]
@@ -103,8 +97,8 @@ def keep_probability(
         )  # fmt: skip
         program = plain.limit_program(nominal, t)
         motion = nominal.run_models(thetas, c, late=True)
-        if misfit is not None:
-            motion = nominal.moved(motion, misfit(nominal.run(c[None]), draws))
+        if plain.misfit is not None:
+            motion = nominal.moved(motion, plain.misfit(nominal.run(c[None]), draws))
         over = program.worst(motion.state, since)
         over[:, ~motion.stable] = np.inf
         kept &= (over <= 1e-3).all(axis=0) & motion.stable
@@ -121,8 +115,53 @@ def keep_probability(
             margins[limit.state] = limit.bound - _quantile(w, request.probability, np.inf)
     return ConstraintSatisfaction(
         hits / draws, low, high, draws, np.maximum(shortfall, 0.0), margins,
-        misfit is not None,
+        plain.misfit is not None,
     )  # fmt: skip
+
+
+def tighten(
+    request: PreparedRequest,
+    first: Found,
+    again: Callable[[PreparedRequest, Found], Found | None],
+    units: Callable[[Found], list[Array]],
+    rounds: int,
+) -> tuple[PreparedRequest, Found, ConstraintSatisfaction]:
+    """Search again with tighter path limits until they are kept with the wanted probability.
+
+    Parameters
+    ----------
+    request : PreparedRequest
+        With the limits as they were asked for.
+    first : object
+        What was found with them.
+    again : callable
+        Searches with tighter limits, given what was found last; None ends it.
+    units : callable
+        Unit coordinates of what was found, one a trial.
+    rounds : int
+
+    Returns
+    -------
+    tuple
+        The request of the search that keeps the limits best, what it found, and how it keeps them.
+    """
+    keeping = keep_probability(request, units(first))
+    best = (request, first, keeping)
+    last, shortfall = first, keeping.shortfall
+    backoff = np.zeros(len(shortfall))
+    for _ in range(rounds):
+        if best[2].probability >= request.probability or not shortfall.any():
+            break
+        backoff = backoff + 1.1 * shortfall
+        tighter = replace(request, backoff=tuple(backoff))
+        found = again(tighter, last)
+        if found is None:
+            break
+        now = keep_probability(request, units(found))
+        last, shortfall = found, now.shortfall
+        if now.probability > best[2].probability:
+            best = (tighter, found, now)
+    return best
 
 
 def _quantile(values: Array, share: float, otherwise: float) -> float:

@@ -120,7 +120,7 @@ class Envelope:
         share = (place - before)[:, None]
         return np.asarray((1 - share) * off[:, before] + share * off[:, before + 1])
 
-    def errors(self, motion: Motion, known: Array | None = None) -> tuple[Array, Array]:
+    def errors(self, motion: Motion, known: Array | float = 0.0) -> tuple[Array, Array]:
         """Return the prediction errors that remain after estimates from R motions.
 
         Parameters
@@ -145,7 +145,7 @@ class Envelope:
             unknown[good, i] = np.einsum("ab,rab->r", w, by_prior)
         return noise, unknown
 
-    def error_without_parts(self, motion: Motion, known: Array | None, parts: int) -> Array:
+    def error_without_parts(self, motion: Motion, known: Array | float, parts: int) -> Array:
         """Return the error (R,) of both kinds with contiguous parts of R motions left out in turn.
 
         The mean over them and over the states; see `errors`.
@@ -162,14 +162,14 @@ class Envelope:
             ]
         return found
 
-    def _covariance(self, gram: Array, known: Array | None) -> Array:
+    def _covariance(self, gram: Array, known: Array | float) -> Array:
         """Return the covariance (R, m, m) of coefficients that moments and the prior leave."""
         unit, outer = self._normal(gram, known)
         return np.asarray(np.linalg.inv(unit) / outer)
 
-    def _normal(self, gram: Array, known: Array | None) -> tuple[Array, Array]:
+    def _normal(self, gram: Array, known: Array | float) -> tuple[Array, Array]:
         """Return G + Λ with a diagonal of one (R, m, m), and what it was divided by."""
-        unit, outer = scaled(gram + np.diag(self._precision) + (0.0 if known is None else known))
+        unit, outer = scaled(gram + np.diag(self._precision) + known)
         # a direction that is hardly excited stays what the prior says it is
         return unit + 1e-9 * np.eye(unit.shape[-1]), outer
 

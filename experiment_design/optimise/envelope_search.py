@@ -74,20 +74,15 @@ def usual_manoeuvres(envelope: Envelope, holds: int, hold: float) -> Array:
         [s]
     """
     settings, steady = envelope.settings, envelope.steady
-    leg = _leg(envelope, hold)
     right, left = _to_both_sides(envelope, _TURN, fast=True)
     slow_right, slow_left = _to_both_sides(envelope, _TURN, fast=False)
-    course = envelope.straight[int(steady[envelope.straight, 0].argmax())]
-    order = [
-        settings[course], right, left, right, left, slow_left, slow_right, slow_left, slow_right,
-    ]  # fmt: skip
-    zigzag = np.repeat(order, leg, axis=0)
-    turn = np.repeat([left], max(2 * leg, holds - len(zigzag)), axis=0)
-    whole = np.concatenate([zigzag, turn])
-    if holds < len(zigzag) + leg:
-        # too short for all of it: every leg gets its share
-        whole = np.array(order)[np.arange(holds) * len(order) // max(holds, 1)]
-    return np.asarray(whole[:holds])
+    course = settings[envelope.straight[int(steady[envelope.straight, 0].argmax())]]
+    order = np.array([
+        course, right, left, right, left, slow_left, slow_right, slow_left, slow_right, left,
+    ])  # fmt: skip
+    # where it is too short for all of it, every leg gets its share
+    leg = max(1, min(_leg(envelope, hold), holds // len(order)))
+    return np.asarray(order[np.minimum(np.arange(holds) // leg, len(order) - 1)])
 
 
 def usual_ends(envelope: Envelope, holds: int, hold: float) -> Array:
@@ -138,7 +133,7 @@ def search_envelope(
     envelope: Envelope,
     seed: int,
     effort: float = 1.0,
-    known: Array | None = None,
+    known: Array | float = 0.0,
     workers: int | None = None,
 ) -> EnvelopeSearch:
     """Search for the sequence that leaves the least error of predictions.

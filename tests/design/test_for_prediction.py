@@ -84,7 +84,7 @@ def test_each_part_is_left_out_in_turn(envelope) -> None:
     whole = envelope.information(motion)[0]
     parts = envelope._by_part(motion, np.array([0]), 4)[:, 0]
     np.testing.assert_allclose(parts.sum(axis=0), whole, rtol=1e-9, atol=1e-9 * whole.max())
-    found = envelope.error_without_parts(motion, None, 4)[0]
+    found = envelope.error_without_parts(motion, 0.0, 4)[0]
     each = []
     for part in parts:
         left = np.linalg.inv(whole - part + np.diag(envelope._precision))
