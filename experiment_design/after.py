@@ -136,8 +136,8 @@ def log_motion(model: ManoeuvringModel, log: TrialLog) -> Motion:
     return Motion(state, tau[known][None], commands[known][None], np.ones(1, bool))
 
 
-def log_moments(envelope: Envelope, motions: Sequence[Motion]) -> Array | None:
-    """Return the moments of what has been sailed, (p + q, p + q), None where nothing was.
+def log_moments(envelope: Envelope, motions: Sequence[Motion]) -> Array | float:
+    """Return the moments of what has been sailed, (p + q, p + q), 0 where nothing was.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def log_moments(envelope: Envelope, motions: Sequence[Motion]) -> Array | None:
         Such as those of `sailed_trial`, of one run each.
     """
     told = [envelope.information(m)[0] for m in motions if m.tau.shape[1]]
-    return np.asarray(np.sum(told, axis=0)) if told else None
+    return sum(told, start=np.zeros(()))
 
 
 def lacking_margin(request: PreparedRequest) -> str:

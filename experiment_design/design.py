@@ -25,7 +25,7 @@ from experiment_design.feasibility.checks import (
 )
 from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
-    keep_probability,
+    tighten,
 )
 from experiment_design.feasibility.least_violation import closest, moved_constant, perturbed
 from experiment_design.information.moments import MomentProgram
@@ -190,9 +190,7 @@ def _design(
     keeping: ConstraintSatisfaction | None = None
     if request.uncertain and not stopped:
         try:
-            request, problems, candidates, keeping, more = _tighten(
-                request, problems, candidates, workers
-            )
+            request, candidates, keeping, more = _tighten(request, problems, candidates, workers)
             evaluations += more
         except KeyboardInterrupt:
             stopped = True
@@ -416,40 +414,31 @@ def _tighten(
     problems: list[TrialProblem],
     candidates: list[Candidate],
     workers: int | None,
-) -> tuple[PreparedRequest, list[TrialProblem], list[Candidate], ConstraintSatisfaction, int]:
+) -> tuple[PreparedRequest, list[Candidate], ConstraintSatisfaction, int]:
     """Tighten the path limits until they are kept with the wanted probability."""
     spent = 0
-    plain = replace(request, backoff=())
-    keeping = keep_probability(plain, [c.unit for c in candidates])
-    best = (request, problems, candidates, keeping)
-    backoff = np.zeros(len(keeping.shortfall))
-    previous, shortfall = candidates, keeping.shortfall
-    for _ in range(_TIGHTENINGS):
-        if best[3].probability >= request.probability or not shortfall.any():
-            break
-        backoff = backoff + 1.1 * shortfall
-        tighter = replace(request, backoff=tuple(backoff))
-        again = [build_problem(tighter, t) for t in range(request.trials)]
+
+    def again(tighter: PreparedRequest, last: list[Candidate]) -> list[Candidate] | None:
+        nonlocal spent
         found = search_campaign(
             tighter,
-            again,
-            [c.unit for c in previous],
+            [build_problem(tighter, t) for t in range(request.trials)],
+            [c.unit for c in last],
             effort=_AGAIN * request.effort,
             workers=workers,
             quick=True,
         )
         spent += found.evaluations
-        if not all(np.isfinite(c.value) for c in found.candidates):
-            break
-        now = keep_probability(plain, [c.unit for c in found.candidates])
-        previous, shortfall = list(found.candidates), now.shortfall
-        if now.probability > best[3].probability:
-            # what is reported is measured against the limits as they were asked for
-            renewed = [
-                assess(p, c.unit[None])[0] for p, c in zip(problems, found.candidates, strict=True)
-            ]
-            best = (tighter, problems, renewed, now)
-    return (*best, spent)
+        kept = all(np.isfinite(c.value) for c in found.candidates)
+        return list(found.candidates) if kept else None
+
+    tighter, found, keeping = tighten(
+        request, candidates, again, lambda found: [c.unit for c in found], _TIGHTENINGS
+    )
+    if found is not candidates:
+        # what is reported is measured against the limits as they were asked for
+        candidates = [assess(p, c.unit[None])[0] for p, c in zip(problems, found, strict=True)]
+    return tighter, candidates, keeping, spent
 
 
 def _margins(problems: list[TrialProblem], motions: tuple[Motion, ...]) -> dict[str, float]:

@@ -367,6 +367,7 @@ def design_for_causes(
     require_horizon(request)
     causes, tried, notes = open_causes(request, model, asked)
     found, _ = operating_envelope(request, model, envelope or {})
+    request = replace(request, misfit=found.misled)
     if not kept_start:
         request = replace(request, starts=(found.rollout.start,))
     problem = build_problem(request)

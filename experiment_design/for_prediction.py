@@ -17,14 +17,14 @@ from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.checks import require_horizon
 from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
-    keep_probability,
+    tighten,
 )
 from experiment_design.information.envelope import Envelope, build_envelope
 from experiment_design.optimise.campaign import random_campaign
 from experiment_design.optimise.envelope_search import (
-    VALIDATION,
     EnvelopeSearch,
     search_envelope,
+    usual_ends,
 )
 from experiment_design.optimise.lead_in import after_lead_in
 from experiment_design.output.result import Design, PlanPart
@@ -33,8 +33,7 @@ from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
-from greybox.trial.plan_parts import LEAD_IN, TRIAL
-from greybox.trial.plan_parts import VALIDATION as VALIDATION_PART
+from greybox.trial.plan_parts import LEAD_IN, TRIAL, VALIDATION
 
 Array = NDArray[np.float64]
 
@@ -88,11 +87,18 @@ class PredictionDesign:
                 "error_by_misfit": self.misfit,
                 "random_error_over_this": self.random,
                 "envelope": {n: list(r) for n, r in self.commands.items()},
-                "validation_share": VALIDATION,
+                "validation_share": self.validation_share,
                 "crossings": [list(c) for c in self.crossings],
                 "prior": self.level,
             },
         }
+
+    @property
+    def validation_share(self) -> float:
+        """Share of the first trial, lead-in included, that is its validation."""
+        return sum(
+            self.design.share(p) for p in self.design.parts if p.name == VALIDATION and not p.trial
+        )
 
     def headline(self) -> str:
         """Return in one sentence what the plan is for and what is expected of it."""
@@ -126,8 +132,8 @@ class PredictionDesign:
             f"{r.duration:g} s for prediction, both sides, {ranges}",
             *(["planned without an estimated model, from main dimensions"] if r.untried else []),
             self.headline(),
-            f"the last {VALIDATION:.0%} of each trial may judge an estimate that takes no part in "
-            f"it (--plan of greybox estimate)",
+            f"the last {self.validation_share:.0%} of each trial, a usual zig-zag or turn, judges "
+            f"an estimate of the rest, then joins it (--plan of greybox estimate)",
         ]
         if self.crossings:
             part = sum(b - a for a, b in self.crossings) / r.duration
@@ -294,7 +300,8 @@ def _design(
     found, level = operating_envelope(request, model, given)
     states = request.structure.states
     others = (found.rollout.start,) * request.trials
-    asked = replace(request, starts=(*request.starts[:kept_starts], *others[kept_starts:]))
+    starts = (*request.starts[:kept_starts], *others[kept_starts:])
+    asked = replace(request, starts=starts, misfit=found.misled)
     if kept_starts:
         asked = after_lead_in(asked)
     before = log_moments(found, sailed)
@@ -305,8 +312,9 @@ def _design(
         asked, tightened, searches, keeping, kept_starts=kept_starts, began=began,
         certificate="a plan for prediction has no bound to be measured against",
     )  # fmt: skip
-    design = replace(design, parts=_parts(asked, design.parts))
-    known = _sum(before, log_moments(found, design.motions[1:]))
+    ended = usual_ends(found, asked.schedule.holds, asked.hold).shape[1]
+    design = replace(design, parts=_parts(asked, design.parts, ended))
+    known = before + log_moments(found, design.motions[1:])
     noise, unknown = found.errors(design.motions[0], known)
     kept = searches[0].random[np.isfinite(searches[0].random)]
     usual = float(np.median(np.exp(-kept))) if len(kept) else float("nan")
@@ -335,25 +343,18 @@ def _of_start(start: str, kept: int, trials: int) -> tuple[str, ...]:
     return (f"{which} from a steady motion: {start} (--start to change)",)
 
 
-def _parts(request: PreparedRequest, led: tuple[PlanPart, ...]) -> tuple[PlanPart, ...]:
-    """Return what leads in, what is sailed for the estimate, and the part that may judge it."""
-    holds = request.schedule.holds
+def _parts(request: PreparedRequest, led: tuple[PlanPart, ...], ended: int) -> tuple[PlanPart, ...]:
+    """Return what leads in, what is searched for, and the last holds, by which it is judged."""
     first = 0.0 if request.lead_in is None else request.lead_in.seconds
-    begin = first + (holds - round(VALIDATION * holds)) * request.hold
+    begin = first + (request.schedule.holds - ended) * request.hold
     last = first + request.duration
     if begin >= last:
         return led
-    spans = ((TRIAL, first, begin), (VALIDATION_PART, begin, last))
+    spans = ((TRIAL, first, begin), (VALIDATION, begin, last))
     return (
         *(part for part in led if part.name == LEAD_IN),
         *(PlanPart(name, t, a, b) for t in range(request.trials) for name, a, b in spans),
     )
-
-
-def _sum(first: Array | None, second: Array | None) -> Array | None:
-    if first is None or second is None:
-        return second if first is None else first
-    return first + second
 
 
 def described_plan(
@@ -433,25 +434,14 @@ def tightened_search(
     searches = campaign(request)
     if not request.uncertain:
         return request, searches, None
-    plain = request
-    keeping = keep_probability(plain, [s.candidate.unit for s in searches])
-    best = (request, searches, keeping)
-    backoff, shortfall = np.zeros(len(keeping.shortfall)), keeping.shortfall
-    for _ in range(_TIGHTENINGS):
-        if best[2].probability >= request.probability or not shortfall.any():
-            break
-        backoff = backoff + 1.1 * shortfall
-        tighter = replace(plain, backoff=tuple(backoff))
-        again = campaign(tighter)
-        now = keep_probability(plain, [s.candidate.unit for s in again])
-        shortfall = now.shortfall
-        if now.probability > best[2].probability:
-            best = (tighter, again, now)
-    return best
+    return tighten(
+        request, searches, lambda tighter, _: campaign(tighter),
+        lambda found: [s.candidate.unit for s in found], _TIGHTENINGS,
+    )  # fmt: skip
 
 
 def _campaign(
-    request: PreparedRequest, envelope: Envelope, before: Array | None, workers: int | None
+    request: PreparedRequest, envelope: Envelope, before: Array | float, workers: int | None
 ) -> list[EnvelopeSearch]:
     found: list[EnvelopeSearch] = []
     known = before
@@ -462,9 +452,8 @@ def _campaign(
         )
         found.append(search)
         commands = problem.schedule.expand(problem.levels(search.candidate.unit))
-        known = _sum(
-            known, envelope.information(problem.scenarios[0].rollout.run(commands[None]))[0]
-        )
+        motion = problem.scenarios[0].rollout.run(commands[None])
+        known = known + envelope.information(motion)[0]
     return found
 
 

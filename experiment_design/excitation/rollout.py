@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
@@ -44,6 +45,10 @@ class Motion:
     tau: Array
     commands: Array
     stable: NDArray[np.bool_]
+
+
+# by how much so many draws of forces that a prior does not say move a run, (D, N+1, nx)
+Misfit = Callable[[Motion, int], Array]
 
 
 class Rollout:
@@ -141,17 +146,33 @@ class Rollout:
             bound=bound,
         )  # fmt: skip
         stable = free.diverged < 0
-        state = np.zeros((len(tau), samples + 1, self.nx + 3))
         with np.errstate(invalid="ignore", over="ignore"):
-            state[..., : self.nx] = free.x
-            state[..., self.nx] = free.psi
-            pair = np.zeros((*free.x.shape[:2], 2))
-            pair[..., 0] = free.x[..., structure.states.index("u")]
-            if "v" in structure.states:
-                pair[..., 1] = free.x[..., structure.states.index("v")]
-            state[..., self.nx + 1 :] = positions(pair, free.psi, self.sample_time)
+            state = self._with_way(free.x, free.psi)
         state[~stable] = 0.0
         return Motion(state, tau, commands, stable)
+
+    def moved(self, motion: Motion, by: Array) -> Motion:
+        """Return R runs whose states are off (R, N+1, nx), heading and place as they follow."""
+        x, psi = self.off(motion.state[..., : self.nx], motion.state[..., self.nx], by)
+        state = self._with_way(x, psi)
+        state[~motion.stable] = 0.0
+        return Motion(state, motion.tau, motion.commands, motion.stable)
+
+    def off(self, x: Array, psi: Array, by: Array) -> tuple[Array, Array]:
+        """Return states (R, N+1, nx) and headings (R, N+1) that are off by so much (R, N+1, nx)."""
+        if "r" in self.structure.states:
+            turned = np.cumsum(by[:, :-1, self.structure.states.index("r")], axis=1)
+            psi = psi + self.sample_time * np.pad(turned, ((0, 0), (1, 0)))
+        return x + by, psi
+
+    def _with_way(self, x: Array, psi: Array) -> Array:
+        """Return states (R, N+1, nx), heading (R, N+1) and the place that they lead to."""
+        states = self.structure.states
+        pair = np.zeros((*x.shape[:2], 2))
+        pair[..., 0] = x[..., states.index("u")]
+        if "v" in states:
+            pair[..., 1] = x[..., states.index("v")]
+        return np.concatenate([x, psi[..., None], positions(pair, psi, self.sample_time)], axis=-1)
 
     def pull(self, motion: Motion, d_state: Array, d_tau: Array, d_commands: Array) -> Array:
         """Carry the derivatives of a scalar along one run back to its commands.

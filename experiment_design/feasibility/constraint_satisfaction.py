@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,8 @@ from experiment_design.request.request import PreparedRequest
 from greybox.numerics.binomial import wilson_interval
 
 Array = NDArray[np.float64]
+
+Found = TypeVar("Found")
 
 _DRAWS = 400
 
@@ -33,6 +36,8 @@ class ConstraintSatisfaction:
         (m,) by how much each path limit is missed at the wanted quantile, in its unit.
     margins : dict of str to float
         The margins that are kept with the wanted probability.
+    misled : bool
+        Whether forces that the prior's misfit leaves open moved them too.
     """
 
     probability: float
@@ -41,12 +46,15 @@ class ConstraintSatisfaction:
     draws: int
     shortfall: Array
     margins: dict[str, float]
+    misled: bool = False
 
     def sentence(self) -> str:
         """Return one sentence for the summary."""
         return (
             f"limits are kept with probability {self.probability:.2f} "
             f"({self.lower:.2f} to {self.upper:.2f}) under {self.draws} models drawn from the prior"
+            + " and its misfit"
+            * self.misled
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -89,6 +97,8 @@ def keep_probability(
         )  # fmt: skip
         program = plain.limit_program(nominal, t)
         motion = nominal.run_models(thetas, c, late=True)
+        if plain.misfit is not None:
+            motion = nominal.moved(motion, plain.misfit(nominal.run(c[None]), draws))
         over = program.worst(motion.state, since)
         over[:, ~motion.stable] = np.inf
         kept &= (over <= 1e-3).all(axis=0) & motion.stable
@@ -104,8 +114,54 @@ def keep_probability(
         if isinstance(limit, Margin):
             margins[limit.state] = limit.bound - _quantile(w, request.probability, np.inf)
     return ConstraintSatisfaction(
-        hits / draws, low, high, draws, np.maximum(shortfall, 0.0), margins
-    )
+        hits / draws, low, high, draws, np.maximum(shortfall, 0.0), margins,
+        plain.misfit is not None,
+    )  # fmt: skip
+
+
+def tighten(
+    request: PreparedRequest,
+    first: Found,
+    again: Callable[[PreparedRequest, Found], Found | None],
+    units: Callable[[Found], list[Array]],
+    rounds: int,
+) -> tuple[PreparedRequest, Found, ConstraintSatisfaction]:
+    """Search again with tighter path limits until they are kept with the wanted probability.
+
+    Parameters
+    ----------
+    request : PreparedRequest
+        With the limits as they were asked for.
+    first : object
+        What was found with them.
+    again : callable
+        Searches with tighter limits, given what was found last; None ends it.
+    units : callable
+        Unit coordinates of what was found, one a trial.
+    rounds : int
+
+    Returns
+    -------
+    tuple
+        The request of the search that keeps the limits best, what it found, and how it keeps them.
+    """
+    keeping = keep_probability(request, units(first))
+    best = (request, first, keeping)
+    last, shortfall = first, keeping.shortfall
+    backoff = np.zeros(len(shortfall))
+    for _ in range(rounds):
+        if best[2].probability >= request.probability or not shortfall.any():
+            break
+        backoff = backoff + 1.1 * shortfall
+        tighter = replace(request, backoff=tuple(backoff))
+        found = again(tighter, last)
+        if found is None:
+            break
+        now = keep_probability(request, units(found))
+        last, shortfall = found, now.shortfall
+        if now.probability > best[2].probability:
+            best = (tighter, found, now)
+    return best
 
 
 def _quantile(values: Array, share: float, otherwise: float) -> float:

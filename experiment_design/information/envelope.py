@@ -29,6 +29,7 @@ from greybox.errors import InfeasibleError
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.model.run.step import StepModel
+from greybox.numerics.linalg import scaled, trace_with_inverse
 from greybox.numerics.vectorised import Vectorised
 
 Array = NDArray[np.float64]
@@ -100,7 +101,26 @@ class Envelope:
     _moments: tuple[Array, ...] = field(repr=False)
     _precision: Array = field(repr=False)
 
-    def errors(self, motion: Motion, known: Array | None = None) -> tuple[Array, Array]:
+    def misled(self, motion: Motion, draws: int) -> Array:
+        """Return by how much forces drawn from the prior's misfit move one run, (D, N+1, nx).
+
+        To first order, beside the primary terms that imitate them best over the envelope.
+        """
+        rows, every = _sensitivities(self.rollout, self.predictor, self._features, motion)
+        p = len(self.predictor.columns)
+        beta = np.random.default_rng(53).standard_normal((draws, len(self._precision) - p))
+        beta /= np.sqrt(self._precision[p:])
+        imitated = beta @ _imitation(self._moments, p).T
+        off = np.stack([np.concatenate([-imitated, beta], axis=1) @ row[0].T for row in rows], 1)
+        known = np.minimum(every * np.arange(off.shape[1] + 1), motion.tau.shape[1])
+        off = np.pad(off, ((0, 0), (1, 0), (0, 0)))
+        at = np.arange(motion.tau.shape[1] + 1)
+        place = np.interp(at, known, np.arange(len(known)))
+        before = np.minimum(place.astype(int), len(known) - 2)
+        share = (place - before)[:, None]
+        return np.asarray((1 - share) * off[:, before] + share * off[:, before + 1])
+
+    def errors(self, motion: Motion, known: Array | float = 0.0) -> tuple[Array, Array]:
         """Return the prediction errors that remain after estimates from R motions.
 
         Parameters
@@ -125,7 +145,7 @@ class Envelope:
             unknown[good, i] = np.einsum("ab,rab->r", w, by_prior)
         return noise, unknown
 
-    def error_without_parts(self, motion: Motion, known: Array | None, parts: int) -> Array:
+    def error_without_parts(self, motion: Motion, known: Array | float, parts: int) -> Array:
         """Return the error (R,) of both kinds with contiguous parts of R motions left out in turn.
 
         The mean over them and over the states; see `errors`.
@@ -135,17 +155,23 @@ class Envelope:
         found[good] = 0.0
         whole, w = grams.sum(axis=0), np.mean(self._moments, axis=0)
         for part in grams:
-            left = self._covariance(whole - part, known)
-            found[good] += np.einsum("ab,rab->r", w, left) / parts
+            units, outers = self._normal(whole - part, known)
+            found[good] += [
+                trace_with_inverse(w / outer, unit) / parts
+                for unit, outer in zip(units, outers, strict=True)
+            ]
         return found
 
-    def _covariance(self, gram: Array, known: Array | None) -> Array:
+    def _covariance(self, gram: Array, known: Array | float) -> Array:
         """Return the covariance (R, m, m) of coefficients that moments and the prior leave."""
-        gram = gram + np.diag(self._precision) + (0.0 if known is None else known)
-        size = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
-        outer = size[:, :, None] * size[:, None, :]
+        unit, outer = self._normal(gram, known)
+        return np.asarray(np.linalg.inv(unit) / outer)
+
+    def _normal(self, gram: Array, known: Array | float) -> tuple[Array, Array]:
+        """Return G + Λ with a diagonal of one (R, m, m), and what it was divided by."""
+        unit, outer = scaled(gram + np.diag(self._precision) + known)
         # a direction that is hardly excited stays what the prior says it is
-        return np.asarray(np.linalg.inv(gram / outer + 1e-9 * np.eye(size.shape[1])) / outer)
+        return unit + 1e-9 * np.eye(unit.shape[-1]), outer
 
     def information(self, motion: Motion) -> Array:
         """Return what output error tells of primary and potential terms, G (R, p + q, p + q)."""
@@ -231,7 +257,8 @@ class _Features:
         self._centres = kmeans2(scaled, _CENTRES, minit="++", seed=seed)[0]
         self._width = float(signals.shape[1])
         values, vectors = np.linalg.eigh(self._kernel(self._centres))
-        kept = values > 1e-6 * values[-1]
+        # those of least variance, together less than what not even potential terms say
+        kept = np.cumsum(values) > _UNSAID**2 * values.sum()
         self._root = vectors[:, kept] / np.sqrt(values[kept])
         self.size = self._root.shape[1]
 
@@ -389,6 +416,16 @@ def _sensitivities(
     return walk(), every
 
 
+def _imitation(moments: tuple[Array, ...], p: int) -> Array:
+    """Return the coefficients (p, q) of the primary terms that imitate each potential one best."""
+    total = np.sum(moments, axis=0)
+    size = np.sqrt(np.diag(total))
+    size[size == 0] = 1.0
+    unit = total / np.outer(size, size)
+    best = np.linalg.solve(unit[:p, :p] + 1e-9 * np.eye(p), unit[:p, p:])
+    return np.asarray(best * size[p:] / size[:p, None])
+
+
 def _prior_variance(moments: tuple[Array, ...], p: int, share: Array) -> Array:
     """Return the variance (q,) of the potential terms' coefficients, one for each equation.
 
@@ -396,13 +433,8 @@ def _prior_variance(moments: tuple[Array, ...], p: int, share: Array) -> Array:
     """
     from scipy.optimize import nnls
 
-    total, nx = np.sum(moments, axis=0), len(moments)
-    size = np.sqrt(np.diag(total))
-    size[size == 0] = 1.0
-    unit = total / np.outer(size, size)
-    best = np.linalg.solve(unit[:p, :p] + 1e-9 * np.eye(p), unit[:p, p:])
-    best = best * size[p:] / size[:p, None]
-    k = (len(total) - p) // nx
+    best, nx = _imitation(moments, p), len(moments)
+    k = best.shape[1] // nx
     left = np.empty((nx, nx))
     for i, w in enumerate(moments):
         rest = w[p:, p:] - best.T @ w[:p, p:] - w[p:, :p] @ best + best.T @ w[:p, :p] @ best

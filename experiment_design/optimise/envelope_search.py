@@ -24,19 +24,21 @@ Array = NDArray[np.float64]
 
 # random sequences that a search begins with, and that a plan is compared with
 RANDOM = 200
-# share of the trial by which an estimate may be judged that it takes no part in
-VALIDATION = 1 / 3
+# share of a trial, at its end, that is a usual manoeuvre, by which an estimate of the rest is
+# judged; at least two legs of a zig-zag, and at most this much
+_VALIDATION, _LONGEST_VALIDATION = 0.15, 1 / 3
 # parts of a trial: an estimate chooses its terms by leaving out each of as many in turn, and what
 # is left must tell what the part that is left out shows
 _PARTS = 4
 _CHAINS, _KEPT, _TOGETHER, _ROUNDS = 4, 12, 64, 14
-# of the largest steady yaw rate: how hard the zig-zag turns; time scales of each of its legs
-_TURN, _LEG = 0.6, 3.0
+# of the largest steady yaw rate: how hard the zig-zag turns, and how hard those that a trial may
+# end with; time scales of each leg
+_TURN, _TURNS, _LEG = 0.6, (0.3, 0.6, 0.9), 3.0
 # share of the trial that either sign of sway and of yaw rate takes at least, where the envelope
 # has both
 _EITHER = 0.35
-# share of moves that draw a stretch anew; the others swap two
-_ANEW = 0.7
+# share of moves that draw a stretch anew; the others swap two; share of sequences that end anew
+_ANEW, _ENDS_ANEW = 0.7, 0.1
 
 
 @dataclass(frozen=True)
@@ -72,29 +74,58 @@ def usual_manoeuvres(envelope: Envelope, holds: int, hold: float) -> Array:
         [s]
     """
     settings, steady = envelope.settings, envelope.steady
-    leg = max(1, round(_LEG * envelope.time_scale / hold))
+    right, left = _to_both_sides(envelope, _TURN, fast=True)
+    slow_right, slow_left = _to_both_sides(envelope, _TURN, fast=False)
+    course = settings[envelope.straight[int(steady[envelope.straight, 0].argmax())]]
+    order = np.array([
+        course, right, left, right, left, slow_left, slow_right, slow_left, slow_right, left,
+    ])  # fmt: skip
+    # where it is too short for all of it, every leg gets its share
+    leg = max(1, min(_leg(envelope, hold), holds // len(order)))
+    return np.asarray(order[np.minimum(np.arange(holds) // leg, len(order) - 1)])
+
+
+def usual_ends(envelope: Envelope, holds: int, hold: float) -> Array:
+    """Return the zig-zags and turns that a trial may end with, levels (M, E, nc).
+
+    Each at two speeds, three rates of turn, and to either side first.
+
+    Parameters
+    ----------
+    envelope : Envelope
+    holds : int
+        Of the whole trial.
+    hold : float
+        [s]
+    """
+    leg = _leg(envelope, hold)
+    count = min(max(round(_VALIDATION * holds), 2 * leg), int(_LONGEST_VALIDATION * holds))
+    # too short for two legs: each gets its half
+    leg = max(1, min(leg, count // 2))
+    other = np.arange(count) // leg % 2
+    ends = []
+    for share in _TURNS:
+        for fast in (True, False):
+            pair = np.array(_to_both_sides(envelope, share, fast=fast))
+            ends += [pair[other], pair[1 - other], pair[0 * other], pair[0 * other + 1]]
+    return np.array(ends)
+
+
+def _leg(envelope: Envelope, hold: float) -> int:
+    """Return how many holds a leg of a zig-zag lasts."""
+    return max(1, round(_LEG * envelope.time_scale / hold))
+
+
+def _to_both_sides(envelope: Envelope, share: float, *, fast: bool) -> tuple[Array, Array]:
+    """Return the settings (nc,) that turn to starboard and port by a share of the largest rate."""
+    settings, steady = envelope.settings, envelope.steady
     rate = steady[:, -1] if steady.shape[1] > 1 else np.zeros(len(steady))
     middle = np.median(steady[:, 0])
-    sides = []
-    for fast in (True, False):
-        part = steady[:, 0] >= middle if fast else steady[:, 0] < middle
-        # straight motion passes for both sides of a ship that cannot turn
-        wanted = _TURN * np.abs(rate[part]).max(initial=0.0)
-        sides.append(
-            [settings[part][int(np.abs(rate[part] - s * wanted).argmin())] for s in (1, -1)]
-        )
-    (right, left), (slow_right, slow_left) = sides
-    course = envelope.straight[int(steady[envelope.straight, 0].argmax())]
-    order = [
-        settings[course], right, left, right, left, slow_left, slow_right, slow_left, slow_right,
-    ]  # fmt: skip
-    zigzag = np.repeat(order, leg, axis=0)
-    turn = np.repeat([left], max(2 * leg, holds - len(zigzag)), axis=0)
-    whole = np.concatenate([zigzag, turn])
-    if holds < len(zigzag) + leg:
-        # too short for all of it: every leg gets its share
-        whole = np.array(order)[np.arange(holds) * len(order) // max(holds, 1)]
-    return np.asarray(whole[:holds])
+    part = steady[:, 0] >= middle if fast else steady[:, 0] < middle
+    # straight motion passes for both sides of a ship that cannot turn
+    wanted = share * np.abs(rate[part]).max(initial=0.0)
+    right, left = (settings[part][int(np.abs(rate[part] - s * wanted).argmin())] for s in (1, -1))
+    return right, left
 
 
 def search_envelope(
@@ -102,7 +133,7 @@ def search_envelope(
     envelope: Envelope,
     seed: int,
     effort: float = 1.0,
-    known: Array | None = None,
+    known: Array | float = 0.0,
     workers: int | None = None,
 ) -> EnvelopeSearch:
     """Search for the sequence that leaves the least error of predictions.
@@ -125,7 +156,11 @@ def search_envelope(
         with np.errstate(divide="ignore"):
             return np.asarray(-0.5 * np.log(envelope.error_without_parts(motion, known, _PARTS)))
 
-    return exchange_settings(problem, envelope, worth, seed, effort=effort, workers=workers)
+    hold = problem.schedule.hold * problem.schedule.sample_time
+    return exchange_settings(
+        problem, envelope, worth, seed, effort=effort, workers=workers,
+        ends=usual_ends(envelope, problem.shape[0], hold),
+    )  # fmt: skip
 
 
 def exchange_settings(
@@ -137,6 +172,7 @@ def exchange_settings(
     effort: float = 1.0,
     tries: int = _TOGETHER,
     workers: int | None = None,
+    ends: Array | None = None,
 ) -> EnvelopeSearch:
     """Search for the sequence of settings of an envelope that is worth most.
 
@@ -154,10 +190,15 @@ def exchange_settings(
         Sequences that each round of each chain tries.
     workers : int, optional
         Processes.
+    ends : ndarray, optional
+        (M, E, nc) one of which the sequence ends with; random sequences do not.
     """
-    holds = problem.shape[0]
+    holds, nc = problem.shape
+    if ends is None:
+        ends = np.empty((1, 0, nc))
+    free = holds - ends.shape[1]
     hold = problem.schedule.hold * problem.schedule.sample_time
-    longest = max(1, min(holds, round(HOLDS[1] * envelope.time_scale / hold)))
+    longest = max(1, min(free, round(HOLDS[1] * envelope.time_scale / hold)))
 
     def judged(levels: Array) -> list[tuple[Array, Candidate]]:
         out = []
@@ -188,13 +229,15 @@ def exchange_settings(
 
     def moved(levels: Array, rng: np.random.Generator) -> Array:
         out = levels.copy()
+        if len(ends) > 1 and rng.random() < _ENDS_ANEW:
+            out[free:] = ends[rng.integers(len(ends))]
         for _ in range(int(rng.integers(1, 4))):
             held = _held(rng, longest)
-            i = int(rng.integers(holds - held + 1))
+            i = int(rng.integers(free - held + 1))
             if rng.random() < _ANEW:
                 out[i : i + held] = envelope.pick(rng)
             else:
-                j = int(rng.integers(holds - held + 1))
+                j = int(rng.integers(free - held + 1))
                 out[i : i + held], out[j : j + held] = (
                     out[j : j + held].copy(), out[i : i + held].copy(),
                 )  # fmt: skip
@@ -211,6 +254,10 @@ def exchange_settings(
     def chain(number: int) -> tuple[Array, Candidate]:
         rng = np.random.default_rng([43, seed, number])
         pool = better(begun)
+        if ends.shape[1]:
+            ended = np.array([levels for levels, _ in pool])
+            ended[:, free:] = ends[rng.integers(len(ends), size=len(ended))]
+            pool = judged(ended)
         for _ in range(rounds):
             parents = rng.integers(len(pool), size=tries)
             children = np.array([moved(pool[i][0], rng) for i in parents])

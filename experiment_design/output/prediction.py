@@ -10,6 +10,7 @@ from scipy.spatial import ConvexHull
 
 from experiment_design.constraints.kinds.sea_room import edge_distance
 from experiment_design.output.result import Design
+from experiment_design.request.request import build_problem
 from greybox.model.run.simulation import positions, simulate
 from greybox.vessel.actuation import actuated_force
 
@@ -144,6 +145,9 @@ def predict_motion(design: Design, draws: int = 200) -> tuple[MotionBand, ...]:
         )  # fmt: skip
         stable = free.diverged < 0
         x, psi = free.x[stable], np.asarray(free.psi)[stable]
+        if r.misfit is not None:
+            rollout = build_problem(r, trial).scenarios[0].rollout
+            x, psi = rollout.off(x, psi, r.misfit(design.motions[trial], draws)[stable])
         names, drawn = _signals(design, x, psi)
         nominal = _signals(design, *_nominal(design, trial))[1][0]
         if draws == 1 or not len(drawn):

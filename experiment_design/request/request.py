@@ -19,7 +19,7 @@ from experiment_design.constraints.limits import (
 from experiment_design.criteria.covariance import Criterion
 from experiment_design.criteria.optimality import CRITERIA
 from experiment_design.criteria.t_optimality import Contrast
-from experiment_design.excitation.rollout import Rollout
+from experiment_design.excitation.rollout import Misfit, Rollout
 from experiment_design.excitation.schedule import Schedule, make_schedule
 from experiment_design.information.estimators import ESTIMATORS
 from experiment_design.information.moments import Moments
@@ -246,6 +246,8 @@ class PreparedRequest(TrialOptions):
         Names and information matrix of earlier trials.
     covariance : ndarray, optional
         (p, p) uncertainty of `theta`; None or zero: known exactly.
+    misfit : callable, optional
+        Moves a run by draws of the forces that the prior does not say; None: it says all.
     backoff : tuple of float
         By how much each path limit is tightened, in its unit, to be kept with `probability`.
     contrasts : tuple of (CandidateModel, CandidateModel)
@@ -278,6 +280,7 @@ class PreparedRequest(TrialOptions):
     gust: float = 0.0
     known: tuple[tuple[str, ...], Array] | None = None
     covariance: Array | None = None
+    misfit: Misfit | None = None
     backoff: tuple[float, ...] = ()
     contrasts: tuple[tuple[CandidateModel, CandidateModel], ...] = ()
     integrator: Integrator = "euler"
@@ -386,7 +389,9 @@ class PreparedRequest(TrialOptions):
 
     @property
     def uncertain(self) -> bool:
-        """Whether the parameters of the prior model are uncertain: it has a covariance."""
+        """Whether the motion under the prior model is: it has a covariance, or a misfit."""
+        if self.misfit is not None:
+            return True
         return self.covariance is not None and bool(np.diag(self.covariance).max(initial=0.0) > 0)
 
     def thetas(self) -> Array:

@@ -24,6 +24,7 @@ from greybox.numerics.effort import EFFORT
 from greybox.public import one_thread
 
 if TYPE_CHECKING:
+    from greybox.estimation.result import Estimate
     from greybox.report.page import Page
     from greybox.selection.estimate_stream import StreamEstimate
     from greybox.selection.request import Request
@@ -135,8 +136,8 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--plan",
         metavar="PLAN",
-        help="plan of greybox design that the ship followed: its lead-in is left out, and the "
-        "prediction is judged on its validation part as on logs of --validate",
+        help="plan of greybox design that the ship followed: its lead-in is left out, and its "
+        "validation part judges an estimate of the rest before it takes part in the model",
     )
     group.add_argument(
         "--margin-u",
@@ -317,6 +318,17 @@ def _choose(
     )
 
 
+def _with_verdict_of(estimate: Estimate, judged: Estimate) -> Estimate:
+    """Return an estimate with the verdict on one of fewer samples, unless its own runs diverge."""
+    from greybox.estimation.prediction_verdict import HeldCommandsDiverge
+    from greybox.estimation.verdict import Divergence
+
+    own = estimate.prediction.because if estimate.prediction else ()
+    if any(isinstance(r, Divergence | HeldCommandsDiverge) for r in own):
+        return estimate
+    return replace(estimate, prediction=judged.prediction)
+
+
 @one_thread
 def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
@@ -357,9 +369,12 @@ def run(options: argparse.Namespace) -> None:
         )
     validate, no_part = read_logs(options.validate, vessel, options.sample_time, states)
     parts: tuple[SailedPlan, ...] = ()
+    rest: list[TrialLog] = []
+    judges: list[TrialLog] = []
     if options.plan:
-        logs, judges, parts = by_parts(logs, read_plan(options.plan, vessel))
-        validate = [*validate, *judges]
+        plan = read_plan(options.plan, vessel)
+        rest, judges, parts = by_parts(logs, plan)
+        logs, _, _ = by_parts(logs, [p.with_validation_estimated() for p in plan])
         left_out = (*left_out, *(p.sentence for p in parts))
     margins = {k: v for k, v in (("u", options.margin_u), ("v", options.margin_v)) if v is not None}
     request = Request(
@@ -401,6 +416,11 @@ def run(options: argparse.Namespace) -> None:
         estimate = found.estimate
     else:
         estimate = choice.estimate if choice else estimate_requested(logs, request)
+    if judges:
+        before = replace(request, validate=(*validate, *judges))
+        chosen = _choose(rest, before, options)
+        judged = chosen.estimate if chosen else estimate_requested(rest, before)
+        estimate = _with_verdict_of(estimate, judged)
     estimate = replace(estimate, notes=(*left_out, *no_part, *estimate.notes))
     model = estimate.model()
     told: dict[str, Any] = {"structure_choice": choice.to_list()} if choice else {}

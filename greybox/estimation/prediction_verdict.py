@@ -583,8 +583,8 @@ class PredictionVerdict(DisplayMixin):
         return {
             JudgedOn.HELD_OUT: f"{self.parts} parts of the log{'s' * several}, each left out of "
             f"an estimate in turn",
-            JudgedOn.VALIDATION: f"{len(self.logs)} log{'s' * (len(self.logs) != 1)} that the "
-            f"estimate did not use",
+            JudgedOn.VALIDATION: f"{len(self.logs)} log{'s' * (len(self.logs) != 1)} kept from the "
+            f"estimate that was judged",
             JudgedOn.OWN: f"the log{'s' * several} of the estimate",
         }[self.judged_on]
 

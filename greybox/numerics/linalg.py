@@ -51,6 +51,19 @@ def scaled_logdet(covariance: Array) -> Array:
     return np.where(sign > 0, found + 2 * np.log(sizes(covariance)).sum(axis=-1), np.inf)
 
 
+def trace_with_inverse(weight: Array, matrix: Array) -> float:
+    """Return tr W A⁻¹ of a symmetric W (n, n) and A (n, n), infinite where A is not positive."""
+    from scipy.linalg.lapack import dpotrf, dpotri
+
+    # of a symmetric matrix the transpose is the same in the order that LAPACK reads
+    factor, failed = dpotrf(matrix.T, lower=True)
+    if failed:
+        return np.inf
+    inverse = dpotri(factor, lower=True)[0]
+    below = np.tril(inverse, -1)
+    return float(2 * np.sum(weight * below) + np.diagonal(weight) @ np.diagonal(inverse))
+
+
 def quadratic_form(
     moments: Array, covariance: Array, least: float = 1e-9
 ) -> tuple[float, int, Array]:

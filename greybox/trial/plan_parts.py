@@ -53,6 +53,10 @@ class PlannedTrial:
     commands: Mapping[str, Array]
     parts: tuple[str, ...]
 
+    def with_validation_estimated(self) -> PlannedTrial:
+        """Return the trial with its validation as part of what is estimated on."""
+        return replace(self, parts=tuple(TRIAL if p == VALIDATION else p for p in self.parts))
+
     @property
     def step(self) -> float:
         """Sample time [s]."""
@@ -144,7 +148,10 @@ class SailedPlan:
         if out:
             said += f"; left out of the estimate are {' and '.join(out)}"
         if self.samples.get(VALIDATION):
-            said += f"; its {self.samples[VALIDATION]} samples of validation judge the estimate"
+            said += (
+                f"; its {self.samples[VALIDATION]} samples of validation judged an estimate of the "
+                f"rest, and then took part in this one"
+            )
         return f"{said}."
 
 

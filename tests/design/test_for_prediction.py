@@ -17,7 +17,7 @@ from experiment_design.for_prediction import (
     prior_misfit,
 )
 from experiment_design.information.envelope import _sensitivities, build_envelope
-from experiment_design.optimise.envelope_search import VALIDATION, one_sided, usual_manoeuvres
+from experiment_design.optimise.envelope_search import one_sided, usual_ends, usual_manoeuvres
 from greybox.commands.main import main
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
@@ -84,7 +84,7 @@ def test_each_part_is_left_out_in_turn(envelope) -> None:
     whole = envelope.information(motion)[0]
     parts = envelope._by_part(motion, np.array([0]), 4)[:, 0]
     np.testing.assert_allclose(parts.sum(axis=0), whole, rtol=1e-9, atol=1e-9 * whole.max())
-    found = envelope.error_without_parts(motion, None, 4)[0]
+    found = envelope.error_without_parts(motion, 0.0, 4)[0]
     each = []
     for part in parts:
         left = np.linalg.inv(whole - part + np.diag(envelope._precision))
@@ -116,6 +116,28 @@ def test_the_moments_are_those_of_free_runs(envelope) -> None:
     told = [w[column, column] for w in envelope._moments]
     # sequences of another draw: within a third
     np.testing.assert_allclose(told[1], mean[1], rtol=0.35)
+
+
+def test_forces_that_mislead_move_free_runs_by_the_misfit(envelope) -> None:
+    samples = int(20 * envelope.time_scale / envelope.rollout.sample_time)
+    off = []
+    for seed in range(12):
+        motion = motion_of(envelope, samples, seed)
+        off.append(envelope.misled(motion, 100))
+        assert off[-1].shape == (100, samples + 1, 3)
+        assert not off[-1][:, 0].any()
+    told = np.sqrt(np.mean(np.square(off), axis=(0, 1, 2))) / envelope.spread
+    # no variance is negative, so a state may be given more than its misfit
+    assert (told > 0.7 * envelope.misfit).all()
+    assert told.min() < 1.4 * envelope.misfit.min()
+    # a steady error in surge is a distance
+    run = envelope.rollout.moved(motion, np.broadcast_to([0.1, 0.0, 0.0], off[-1][:1].shape))
+    before, after = motion.state[0, -1], run.state[0, -1]
+    assert after[0] - before[0] == pytest.approx(0.1)
+    assert after[3] == before[3]
+    turned = envelope.rollout.moved(motion, np.broadcast_to([0, 0, 1e-3], off[-1][:1].shape))
+    dt = envelope.rollout.sample_time
+    assert turned.state[0, -1, 3] - before[3] == pytest.approx(1e-3 * samples * dt)
 
 
 def test_a_trial_goes_to_both_sides(envelope) -> None:
@@ -153,6 +175,24 @@ def test_usual_manoeuvres_go_to_both_sides_at_two_speeds(envelope) -> None:
     assert len(usual_manoeuvres(envelope, 5, hold)) == 5
 
 
+def test_usual_ends_are_zigzags_and_turns_for_a_stated_share(envelope) -> None:
+    hold = envelope.time_scale
+    ends = usual_ends(envelope, 100, hold)
+    assert ends.shape[1:] == (15, 3)
+    rate = envelope.steady[
+        [[np.abs(envelope.settings - v).sum(axis=1).argmin() for v in e] for e in ends], 2
+    ]
+    for zigzag, turn in zip(rate[::4], rate[2::4], strict=True):
+        # legs of three lengths, and the turn is one of them
+        assert list(zigzag[:3]) == list(turn[:3])
+        assert len(set(zigzag)) == 2
+        assert zigzag[3] == zigzag[5] != zigzag[6]
+        assert len(set(turn)) == 1
+    # two legs at least, and never more than a third
+    assert usual_ends(envelope, 24, hold).shape[1] == 6
+    assert usual_ends(envelope, 9, hold).shape[1] == 3
+
+
 @pytest.fixture(scope="module")
 def model() -> ManoeuvringModel:
     found = thesis_model(spread=0.02)
@@ -184,16 +224,20 @@ def test_a_plan_leaves_less_than_random_sequences(found) -> None:
     assert found.design.motions[0].state[0, :, 0].min() > 0.2 - 1e-3
 
 
-def test_the_last_third_is_marked_as_what_may_judge_the_estimate(found) -> None:
+def test_a_trial_ends_with_a_usual_manoeuvre_that_judges_the_estimate(found, envelope) -> None:
     trial, validation = found.to_dict()["parts"]
     assert (trial["part"], trial["from"]) == ("trial", 0.0)
     assert (validation["part"], validation["to"]) == ("validation", 200.0)
     assert trial["to"] == validation["from"]
+    assert found.to_dict()["prediction"]["validation_share"] == validation["share"] <= 1 / 3
+    assert f"the last {validation['share']:.0%} of each trial" in found.summary()
     r = found.design.request
-    assert validation["share"] == pytest.approx(VALIDATION, abs=0.5 * r.hold / r.duration)
     begin = round(validation["from"] / r.sample_time)
     plan = found.design.to_pandas()
     assert list(plan["part"]) == ["trial"] * begin + ["validation"] * (len(plan) - begin)
+    # one or two settings, of which the ship's own rates may make ramps
+    held = found.design.levels[0][-round((200.0 - validation["from"]) / r.hold) :]
+    assert len(np.unique(held.round(6), axis=0)) <= 2
 
 
 def test_the_same_request_gives_the_same_plan(found, model) -> None:

@@ -167,7 +167,7 @@ def test_by_command(tmp_path, logs, capsys):
     assert "a log that the estimate used cannot judge it" in capsys.readouterr().err
 
 
-def test_parts_of_a_plan_are_left_out_and_judge(tmp_path, logs, capsys):
+def test_the_validation_of_a_plan_judges_and_then_takes_part(tmp_path, logs, capsys):
     log, plan = logs[0], tmp_path / "plan.csv"
     names = [*log.vessel.commands]
     parts = ["lead-in"] * 40 + ["trial"] * 160 + ["validation"] * 100
@@ -196,12 +196,19 @@ def test_parts_of_a_plan_are_left_out_and_judge(tmp_path, logs, capsys):
         assert data["verdict"]["prediction"]["logs"] == [f"late{late}, validation"]
         found.append(data["theta"])
     assert found[0] == found[1]
-    # what is left out tells nothing: the same estimate by the two parts as logs of their own
+    # the lead-in tells nothing: the model is that of what follows it, and its verdict that on an
+    # estimate of the trial alone by the validation as a log of its own
+    verdict = data["verdict"]["prediction"]
+    whole = write_csv(log.window(40, 300), tmp_path / "whole.csv")
+    assert main([*words, str(whole)]) == 0
+    data = json.loads((tmp_path / "m.json").read_text())
+    np.testing.assert_allclose(found[0], data["theta"])
     fit = write_csv(log.window(40, 200), tmp_path / "fit.csv")
     judge = write_csv(log.window(200, 300), tmp_path / "judge.csv")
     assert main([*words, str(fit), "--validate", str(judge)]) == 0
     data = json.loads((tmp_path / "m.json").read_text())
-    np.testing.assert_allclose(found[0], data["theta"])
+    assert verdict["fit"] == pytest.approx(data["verdict"]["prediction"]["fit"])
+    assert np.abs(np.subtract(found[0], data["theta"])).max() > 0
     capsys.readouterr()
     other = write_csv(logs[1], tmp_path / "other.csv")
     assert main([*words, str(other), "--plan", str(plan)]) == 1
