@@ -12,9 +12,8 @@ from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.preparing import prepare
-from greybox.diagnosis.refitting import final_refit, likelier, refits, seen_as_slow, slow
+from greybox.diagnosis.refitting import final_refit, likelier, promises, refits
 from greybox.diagnosis.result import Given
-from greybox.diagnosis.scores import ProjectedScores, score_hypotheses
 from greybox.diagnosis.search import Search, freed
 from greybox.public import known_keywords, one_thread
 from greybox.trial.log import Logs
@@ -88,10 +87,8 @@ def _likeliest(
 ) -> tuple[Hypothesis, Fit] | None:
     problem = case.problem(fit.integrator)
     near = [a for a in hypotheses if not a.refit_from_scratch]
-    scores = score_hypotheses(ProjectedScores(problem, fit), near)
-    asked = [(fit, score) for score in scores[:_FORMS]]
-    if slow(fit):
-        asked += seen_as_slow(problem, fit, near)
+    scores, forgetful = promises(problem, fit, near)
+    asked = [*((fit, score) for score in scores[:_FORMS]), *forgetful]
     fits = [(a, f) for a, f, _ in likelier(refits(problem, asked, lambda _: None))]
     if not fit.point.hypotheses:
         # coefficients of their own forget the causes before: only the first can have them

@@ -110,17 +110,30 @@ def loosened(problem: Problem, fit: Fit) -> Fit:
     return found if found.cost < fit.cost else fit
 
 
-def seen_as_slow(
+def promises(
     problem: Problem, fit: Fit, hypotheses: Sequence[Hypothesis]
-) -> list[tuple[Fit, Score]]:
-    """Return what to refit from errors that forget, to be judged with their likeliest colour.
+) -> tuple[list[Score], list[tuple[Fit, Score]]]:
+    """Return the scores of hypotheses, the best first, and what to refit from errors that forget.
 
     A force with a long memory imitates most causes; where it was taken for one, what
-    a cause promises is hidden, and its search ends where it began.
+    a cause promises is hidden, and its search ends where it began. What promises most to errors
+    that forget is to be judged with their likeliest colour.
     """
-    plain = problem.forgetful(fit, _FORGOTTEN)
-    promising = shortlist(score_hypotheses(ProjectedScores(problem, plain), hypotheses))
-    return [(plain, score) for score in promising[:_SECOND]]
+    keys = [h.key for h in hypotheses]
+
+    def work(forgets: bool) -> tuple[Fit, list[tuple[int, Array, float]]]:
+        at = problem.forgetful(fit, _FORGOTTEN) if forgets else fit
+        found = score_hypotheses(ProjectedScores(problem, at), hypotheses)
+        told = [(keys.index(s.hypothesis.key), s.value, s.gain) for s in found]
+        # hypotheses are functions, which no other process can send
+        return replace(at, point=replace(at.point, hypotheses=())), told
+
+    plain, *forgetful = [
+        (replace(at, point=fit.point), [Score(hypotheses[k], *promised) for k, *promised in told])
+        for at, told in map_forked(work, [False, *([True] if slow(fit) else [])])
+    ]
+    later = [(at, score) for at, scores in forgetful for score in shortlist(scores)[:_SECOND]]
+    return plain[1], later
 
 
 def likelier(
@@ -144,9 +157,11 @@ def final_refit(case: DiagnosisProblem, fit: Fit, hypothesis: Hypothesis) -> Fit
         return problem.scan(case.likeliest_variant(better, hypothesis), hypothesis)
     if not any(a.refit_from_scratch for a in better.point.hypotheses):
         better = case.refit_from_least_squares(better)
+    before = better
     better = case.likeliest_variant(case.other_integrator(better), hypothesis)
-    # what a sample holds decides how it is best stepped, too
-    better = case.other_integrator(better)
+    if better is not before:
+        # what a sample holds decides how it is best stepped, too
+        better = case.other_integrator(better)
     problem = case.problem(better.integrator)
     # with errors as small as they are now, its hills are steeper
     return problem.scan(loosened(problem, better), hypothesis)

@@ -28,14 +28,13 @@ from greybox.diagnosis.refitting import (
     final_refit,
     likelier,
     on_all_processors,
+    promises,
     refit,
     refits,
-    seen_as_slow,
     shortlist,
-    slow,
 )
 from greybox.diagnosis.result import Quantity
-from greybox.diagnosis.scores import MOMENTS, ProjectedScores, Score, score_hypotheses
+from greybox.diagnosis.scores import MOMENTS, Score
 from greybox.diagnosis.thresholds import (
     BACKWARDS,
     MOST_CAUSES,
@@ -274,10 +273,8 @@ def take_step(
     left = [a for a in hypotheses if not _taken(a, causes)]
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     near = [a for a in left if not a.refit_from_scratch]
-    scores = score_hypotheses(ProjectedScores(problem, fit), near)
-    asked = [(fit, score) for score in shortlist(scores)]
-    if slow(fit):
-        asked += seen_as_slow(problem, fit, near)
+    scores, forgetful = promises(problem, fit, near)
+    asked = [*((fit, score) for score in shortlist(scores)), *forgetful]
     held_out.contributions(fit)
     fits = likelier(refits(problem, asked, lambda found: held_out.prove(fit, found)))
     if not causes:
