@@ -242,8 +242,10 @@ def error_budget(
     without = {c.id: c.errors for c in causes if len(c.errors)}
     before = {name: e0**2 - errors**2 for name, errors in without.items()} | left_over
     if terms is not None and len(terms):
-        without[MOTION] = terms
-        before[MOTION] = before[MOTION] + e0**2 - terms**2
+        # what terms do beside causes only is no share of theirs: it cannot be split
+        alone = (terms**2).sum(axis=0) < (e0**2).sum(axis=0)
+        without[MOTION] = np.where(alone, terms, e0)
+        before[MOTION] = before[MOTION] + e0**2 - without[MOTION] ** 2
     moments = _moments(noise, problem, names, waves, rest)
     rng = np.random.default_rng([seed, 11])
     starts, length = blocks(len(e0), problem.sample_time, _DRAWS, rng)

@@ -87,6 +87,18 @@ def test_terms_without_a_name_belong_to_motion_and_commands(pair: Pair) -> None:
         assert abs(found.after[state]) < 0.02
 
 
+def test_what_terms_do_beside_causes_only_cannot_be_split(pair: Pair) -> None:
+    one, other = two_series(pair)
+    base = beside(pair, one)
+    # without them the model that has no causes would err more
+    worse = off(pair, one, 5 * other).errors
+    budget = {p.part: p for p in error_budget([base], [pair], [], worse, None, 0)}
+    plain = {p.part: p for p in error_budget([base], [pair], [], None, None, 0)}
+    for state in "uvr":
+        assert budget[MOTION].share[state] == pytest.approx(plain[MOTION].share[state])
+        assert budget[REST].share[state] == pytest.approx(plain[REST].share[state])
+
+
 def test_the_noise_of_the_sensors_has_its_own_share(pair: Pair) -> None:
     one, _ = two_series(pair)
     base = beside(pair, one)

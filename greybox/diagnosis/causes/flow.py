@@ -52,11 +52,13 @@ class Current(Cause):
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say speed and direction."""
-        north, east = values["current_north"][0], values["current_east"][0]
+        (north, a), (east, b) = values["current_north"], values["current_east"]
+        speed = float(np.hypot(north, east))
+        std = np.hypot(north * a, east * b) / speed if speed else np.hypot(a, b)
         return (
             f"the errors of surge and sway turn with the heading as in a current of "
-            f"{np.hypot(north, east):.2f} m/s towards "
-            f"{np.rad2deg(np.arctan2(east, north)) % 360:.0f} deg"
+            f"{speed:.2g} ± {std:.1g} m/s towards {np.rad2deg(np.arctan2(east, north)) % 360:.0f} "
+            f"deg"
         )
 
 
