@@ -92,7 +92,8 @@ def _next_steps(record: dict[str, Any], headline: bool) -> list[NextStep]:
         "Sail the plan, and check its log before you leave the area",
         f"greybox check LOG --vessel {vessel} --report check.html",
     )
-    if given.get("between") or given.get("purpose") == "causes":
+    explain = any(map(given.get, ("between", "causes", "diagnosis")))
+    if explain or given.get("purpose") == "causes":
         return [
             check,
             NextStep(

@@ -345,5 +345,9 @@ def test_what_to_do_after_a_plan_follows_its_purpose(short):
     assert commands() == (
         "greybox estimate LOG --vessel V --plan p.csv --out model.json --report model.html"
     )
-    for given in ({"purpose": "causes"}, {"between": ["a.json", "b.json"]}):
+    for given in (
+        {"purpose": "causes"},
+        {"causes": ["current"]},
+        {"between": ["a.json", "b.json"]},
+    ):
         assert commands(**given) == "greybox diagnose LOG --vessel V --report diagnosis.html"
