@@ -85,14 +85,15 @@ def design_page(
     )  # fmt: skip
 
 
-def _next_steps(record: dict[str, Any], between: bool) -> list[NextStep]:
+def _next_steps(record: dict[str, Any], headline: bool) -> list[NextStep]:
     """Return what to do once the plan has been sailed."""
-    vessel = typed(record, "vessel", "V")
+    vessel, given = typed(record, "vessel", "V"), record.get("command", {})
     check = NextStep(
         "Sail the plan, and check its log before you leave the area",
         f"greybox check LOG --vessel {vessel} --report check.html",
     )
-    if between:
+    explain = any(map(given.get, ("between", "causes", "diagnosis")))
+    if explain or given.get("purpose") == "causes":
         return [
             check,
             NextStep(
@@ -100,11 +101,13 @@ def _next_steps(record: dict[str, Any], between: bool) -> list[NextStep]:
                 f"greybox diagnose LOG --vessel {vessel} --report diagnosis.html",
             ),
         ]
+    # one for prediction has a part to judge by
+    part = f" --plan {typed(record, 'out', 'PLAN')}" if headline else ""
     return [
         check,
         NextStep(
             "Estimate the model from it",
-            f"greybox estimate LOG --vessel {vessel} --out model.json --report model.html",
+            f"greybox estimate LOG --vessel {vessel}{part} --out model.json --report model.html",
         ),
     ]
 

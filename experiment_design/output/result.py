@@ -282,10 +282,11 @@ class Design(DisplayMixin):
             lines.append(f"least distance from zero: {margins} (m/s, rad/s)")
         if self.keeping is not None:
             lines.append(self.keeping.sentence())
-        lines += ["", f"{'parameter':<14}{'prior':>12}{'std err':>12}{'relative':>11}"]
+        wide = max(14, *map(len, self.names))
+        lines += ["", f"{'parameter':<{wide}}{'prior':>12}{'std err':>12}{'relative':>11}"]
         for name, value, std in zip(self.names, self.values, self.std, strict=True):
             share = f"{abs(std / value):.1%}" if value else "-"
-            lines.append(f"{name:<14}{value:>12.4g}{std:>12.2g}{share:>11}")
+            lines.append(f"{name:<{wide}}{value:>12.4g}{std:>12.2g}{share:>11}")
         if self.alternatives:
             lines += ["", f"{'instead of':<28}{'tried':>7}{'kept':>7}  this plan gives"]
             for a in self.alternatives:

@@ -341,11 +341,12 @@ class Fleet(DisplayMixin):
         alike = len(self.pooled.theta)
         lines += ["", f"The class, of {alike} ships:"]
         head = ("parameter", "mean", "std error", "between ships", "shrinkage")
-        lines.append(f"  {head[0]:<12}" + "".join(f"{h:>15}" for h in head[1:]) + "  unit")
+        wide = max(12, *map(len, self.names))
+        lines.append(f"  {head[0]:<{wide}}" + "".join(f"{h:>15}" for h in head[1:]) + "  unit")
         for j, name in enumerate(self.names):
             shrunk = float(self.pooled.shrinkage[:, j].mean())
             lines.append(
-                f"  {name:<12}{self.pooled.beta[j]:>15.4g}{self.pooled.beta_std[j]:>15.2g}"
+                f"  {name:<{wide}}{self.pooled.beta[j]:>15.4g}{self.pooled.beta_std[j]:>15.2g}"
                 f"{np.sqrt(self.pooled.omega[j]):>15.2g}{shrunk:>15.2f}  {self.units[j]}"
             )
         lines += ["", f"  {'ship':<20}{'logs':>6}{'distance':>12}{'p adjusted':>12}  fit"]

@@ -213,6 +213,7 @@ class ManoeuvringModel(DisplayMixin):
 
     def summary(self) -> str:
         """Return the equations and the parameters, per sample and per second."""
+        wide = max(16, *(len(self.label(name)) for name, *_ in self.shown_parameters()))
         lines = [
             f"Model of {self.vessel.name}: structure '{self.structure.name}', "
             f"sample time {self.sample_time:g} s, {self.integrator}",
@@ -220,15 +221,15 @@ class ManoeuvringModel(DisplayMixin):
             *self.structure.equations(),
             "u_r, v_r: velocity through the water; u_q, v_q: through the air",
             "",
-            f"{'parameter':<16}{'value':>13}{'std err':>12}{'per second':>13}  unit per sample",
+            f"{'parameter':<{wide}}{'value':>13}{'std err':>12}{'per second':>13}  unit per sample",
         ]
         for name, value, std, unit in self.shown_parameters():
             lines.append(
-                f"{self.label(name):<16}{value:>13.5g}{std:>12.2g}"
+                f"{self.label(name):<{wide}}{value:>13.5g}{std:>12.2g}"
                 f"{value / self.sample_time:>13.5g}  {unit}"
             )
         for name, (value, std) in self.disturbances.items():
-            lines.append(f"{name:<16}{value:>13.5g}{std:>12.2g}{'':>13}  m/s")
+            lines.append(f"{name:<{wide}}{value:>13.5g}{std:>12.2g}{'':>13}  m/s")
         lines += [f"{c.sentence}, of the log's clock" for c in self.changes]
         if self.conditions:
             lines.append(f"estimated at {in_words(self.conditions)}")

@@ -135,7 +135,7 @@ def model_notes(model: ManoeuvringModel, helm: Helm, asked: Conditions) -> tuple
             + (" and of the current" if asked.current and model.disturbances else "")
             + (
                 ". They leave out how far its free runs are off on held-out logs, which MODEL does "
-                "not state (estimate it again), and what waves"
+                "not state (one of greybox estimate does), and what waves"
                 if held_out_errors(model) is None
                 else " and the forces that the model lacks, by how far its free runs were off on "
                 "held-out logs. They leave out what waves"

@@ -361,7 +361,7 @@ def compared_line(row: Compared, length: float) -> str:
 
 def _shown(value: MonteCarloQuantity, angle: bool) -> str:
     factor, unit = (180 / math.pi, " deg") if angle else (1.0, "")
-    low, high = (b * factor for b in value.interval)
+    low, high = (f"{b * factor:.4g}" for b in value.interval)
     # what was ordered is the same in every draw
-    interval = f" (95 %: {low:.4g} to {high:.4g})" if low < high else ""
+    interval = f" (95 %: {low} to {high})" if low != high else ""
     return f"{value.value * factor:.4g}{unit}{interval}"

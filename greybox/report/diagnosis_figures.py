@@ -74,7 +74,8 @@ def run_figure(run: Runs, points: int = _POINTS) -> Figure:
             _line(below, t, np.clip(measured - x, -spread, spread), gaps, points, style)
         below.axhline(0, color=BLACK, linewidth=0.6)
         top.set_ylabel(_SHORT.get(state, state), fontsize=9)
-        below.set_ylabel("error", fontsize=9)
+        unit = _SHORT.get(state, "").partition("[")[2]
+        below.set_ylabel("error" + f"\n[{unit}" * bool(unit), fontsize=9)
         for ax in (top, below):
             tidy(ax)
             ax.yaxis.set_major_locator(MaxNLocator(4 if ax is top else 3))

@@ -141,7 +141,8 @@ def comparison_figure(
         below.set_ylim(gap)
         below.axhline(0, color=BLACK, linewidth=0.6)
         top.set_ylabel(LABELS.get(state, state), fontsize=9)
-        below.set_ylabel("measured −\nsimulated", fontsize=8)
+        unit = LABELS.get(state, "").partition("[")[2]
+        below.set_ylabel("difference" + f"\n[{unit}" * bool(unit), fontsize=8)
         top.legend(
             fontsize=8,
             loc="lower left",

@@ -124,7 +124,8 @@ class LogGaps:
         """What is missing, and what a run and a fit make of it."""
         several = self.count != 1
         where = (
-            f"{'the longest of ' if several else ''}{self.longest:.4g} s at t = {self.start:.6g} s"
+            f"{'the longest of ' if several else ''}{self.longest:.4g} s of samples from "
+            f"t = {self.start:.6g} s on"
         )
         if not self.channels:
             return (

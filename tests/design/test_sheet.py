@@ -335,3 +335,19 @@ def test_in_a_browser(unsure, page, tmp_path):
     printed = tmp_path / "printed.pdf"
     chromium("--no-pdf-header-footer", f"--print-to-pdf={printed}", f"file://{tmp_path}/sheet.html")
     assert len(re.findall(rb"/Type\s*/Page\b", printed.read_bytes())) == 1
+
+
+def test_what_to_do_after_a_plan_follows_its_purpose(short):
+    def commands(**given):
+        page = design_page(short, [], {"command": {"out": "p.csv", **given}}, "It predicts.")
+        return page.next_steps[1].command
+
+    assert commands() == (
+        "greybox estimate LOG --vessel V --plan p.csv --out model.json --report model.html"
+    )
+    for given in (
+        {"purpose": "causes"},
+        {"causes": ["current"]},
+        {"between": ["a.json", "b.json"]},
+    ):
+        assert commands(**given) == "greybox diagnose LOG --vessel V --report diagnosis.html"

@@ -283,6 +283,7 @@ def bad_csv():
     yield "dates", b"time,u\n" + b"5/1/24 3:00 PM,2\n" * 9, "holds '5/1/24 3:00 PM' where the time"
     yield "no time", b"u,v\n" + b"1,2\n" * 9, "no column 't'"
     yield "long line", b"t,u\n1,2\n" + b"7" * (1 << 23) * 3, "no column|cannot read|hold"
+    yield "open quote", b't,u\n1,2\n"3,4\n' + b"5,6\n" * 50, "50 of 52 rows .* never closed"
     yield "narrow", b"t,u,v\n1,2,3\n" + b"1,2,3\n" * 80 + b"1,2\n" * 500, "500 of 581 rows"
 
 

@@ -63,6 +63,7 @@ class CsvFile:
         def skip_row(row: Any) -> str:
             # the half line at the end is no reason to look at the file again
             broken["rows"] += 1
+            broken["quoted"] += (row.text or "").rstrip("\r\n").count("\n")
             return "skip"
 
         words: Counter[str] = Counter()
@@ -105,12 +106,22 @@ class CsvFile:
             ) from None
         if clean.unfinished:
             self._note("the last line has no end: left out, since it may be cut")
-        count = broken["rows"]
+        count, quoted = broken["rows"], broken["quoted"]
+        if quoted > rows:
+            raise LogError(
+                f"{quoted} of {count + quoted + rows} rows of '{self.path.name}' stand inside a "
+                f"quoted cell whose quote is never closed: take the quote out, or export it again."
+            )
         if count > rows:
             raise LogError(
                 f"{count} of {count + rows} rows of '{self.path.name}' have another number of "
                 f"fields than the {len(self.columns)} of its header: give every column a name, "
                 f"or export it again."
+            )
+        if quoted:
+            self._note(
+                f"{quoted} row{'s' if quoted > 1 else ''} inside a quoted cell whose quote is not "
+                f"closed in its row left out"
             )
         if count:
             self._note(
