@@ -24,7 +24,7 @@ from experiment_design.optimise.campaign import random_campaign
 from experiment_design.optimise.envelope_search import (
     EnvelopeSearch,
     search_envelope,
-    usual_ends,
+    usual_beginnings,
 )
 from experiment_design.optimise.lead_in import after_lead_in
 from experiment_design.output.result import Design, PlanPart
@@ -132,7 +132,7 @@ class PredictionDesign:
             f"{r.duration:g} s for prediction, both sides, {ranges}",
             *(["planned without an estimated model, from main dimensions"] if r.untried else []),
             self.headline(),
-            f"the last {self.validation_share:.0%} of each trial, a usual zig-zag or turn, judges "
+            f"the first {self.validation_share:.0%} of each trial, a usual zig-zag or turn, judges "
             f"an estimate of the rest, then joins it (--plan of greybox estimate)",
         ]
         if self.crossings:
@@ -312,12 +312,12 @@ def _design(
         asked, tightened, searches, keeping, kept_starts=kept_starts, began=began,
         certificate="a plan for prediction has no bound to be measured against",
     )  # fmt: skip
-    ended = usual_ends(found, asked.schedule.holds, asked.hold).shape[1]
-    design = replace(design, parts=_parts(asked, design.parts, ended))
+    usual = usual_beginnings(found, asked.schedule.holds, asked.hold).shape[1]
+    design = replace(design, parts=_parts(asked, design.parts, usual))
     known = before + log_moments(found, design.motions[1:])
     noise, unknown = found.errors(design.motions[0], known)
     kept = searches[0].random[np.isfinite(searches[0].random)]
-    usual = float(np.median(np.exp(-kept))) if len(kept) else float("nan")
+    random = float(np.median(np.exp(-kept))) if len(kept) else float("nan")
     v = states.index("v") if "v" in states else None
     crossings: tuple[tuple[float, float], ...] = ()
     if v is not None:
@@ -328,7 +328,7 @@ def _design(
         design,
         {s: float(np.sqrt(noise[0, i]) * found.spread[i]) for i, s in enumerate(states)},
         {s: float(np.sqrt(unknown[0, i]) * found.spread[i]) for i, s in enumerate(states)},
-        usual * np.exp(searches[0].candidate.value) if asked.trials == 1 else float("nan"),
+        random * np.exp(searches[0].candidate.value) if asked.trials == 1 else float("nan"),
         {n: (float(a), float(b)) for n, a, b in
          zip(asked.schedule.commands, found.lower, found.upper, strict=True)},
         crossings,
@@ -343,17 +343,16 @@ def _of_start(start: str, kept: int, trials: int) -> tuple[str, ...]:
     return (f"{which} from a steady motion: {start} (--start to change)",)
 
 
-def _parts(request: PreparedRequest, led: tuple[PlanPart, ...], ended: int) -> tuple[PlanPart, ...]:
-    """Return what leads in, what is searched for, and the last holds, by which it is judged."""
-    first = 0.0 if request.lead_in is None else request.lead_in.seconds
-    begin = first + (request.schedule.holds - ended) * request.hold
-    last = first + request.duration
-    if begin >= last:
+def _parts(request: PreparedRequest, led: tuple[PlanPart, ...], usual: int) -> tuple[PlanPart, ...]:
+    """Return what leads in, the first holds, which judge an estimate of the rest, and the rest."""
+    if not usual:
         return led
-    spans = ((TRIAL, first, begin), (VALIDATION, begin, last))
+    first = 0.0 if request.lead_in is None else request.lead_in.seconds
+    judged = first + usual * request.hold
+    spans = ((VALIDATION, first, judged), (TRIAL, judged, first + request.duration))
     return (
         *(part for part in led if part.name == LEAD_IN),
-        *(PlanPart(name, t, a, b) for t in range(request.trials) for name, a, b in spans),
+        *(PlanPart(n, t, a, b) for t in range(request.trials) for n, a, b in spans),
     )
 
 

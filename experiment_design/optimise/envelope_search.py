@@ -24,21 +24,22 @@ Array = NDArray[np.float64]
 
 # random sequences that a search begins with, and that a plan is compared with
 RANDOM = 200
-# share of a trial, at its end, that is a usual manoeuvre, by which an estimate of the rest is
-# judged; at least two legs of a zig-zag, and at most this much
+# share of a trial, at its beginning, that is a usual manoeuvre, by which an estimate of the rest is
+# judged; at least two legs of a zig-zag, and at most this much. An estimate chooses by its runs on
+# the last part of a log, which must be like all that it is wanted for
 _VALIDATION, _LONGEST_VALIDATION = 0.15, 1 / 3
 # parts of a trial: an estimate chooses its terms by leaving out each of as many in turn, and what
 # is left must tell what the part that is left out shows
 _PARTS = 4
 _CHAINS, _KEPT, _TOGETHER, _ROUNDS = 4, 12, 64, 14
 # of the largest steady yaw rate: how hard the zig-zag turns, and how hard those that a trial may
-# end with; time scales of each leg
+# begin with; time scales of each leg
 _TURN, _TURNS, _LEG = 0.6, (0.3, 0.6, 0.9), 3.0
 # share of the trial that either sign of sway and of yaw rate takes at least, where the envelope
 # has both
 _EITHER = 0.35
-# share of moves that draw a stretch anew; the others swap two; share of sequences that end anew
-_ANEW, _ENDS_ANEW = 0.7, 0.1
+# share of moves that draw a stretch anew; the others swap two; share of sequences that begin anew
+_ANEW, _BEGINS_ANEW = 0.7, 0.1
 
 
 @dataclass(frozen=True)
@@ -85,8 +86,8 @@ def usual_manoeuvres(envelope: Envelope, holds: int, hold: float) -> Array:
     return np.asarray(order[np.minimum(np.arange(holds) // leg, len(order) - 1)])
 
 
-def usual_ends(envelope: Envelope, holds: int, hold: float) -> Array:
-    """Return the zig-zags and turns that a trial may end with, levels (M, E, nc).
+def usual_beginnings(envelope: Envelope, holds: int, hold: float) -> Array:
+    """Return the zig-zags and turns that a trial may begin with, levels (M, B, nc).
 
     Each at two speeds, three rates of turn, and to either side first.
 
@@ -103,12 +104,12 @@ def usual_ends(envelope: Envelope, holds: int, hold: float) -> Array:
     # too short for two legs: each gets its half
     leg = max(1, min(leg, count // 2))
     other = np.arange(count) // leg % 2
-    ends = []
+    found = []
     for share in _TURNS:
         for fast in (True, False):
             pair = np.array(_to_both_sides(envelope, share, fast=fast))
-            ends += [pair[other], pair[1 - other], pair[0 * other], pair[0 * other + 1]]
-    return np.array(ends)
+            found += [pair[other], pair[1 - other], pair[0 * other], pair[0 * other + 1]]
+    return np.array(found)
 
 
 def _leg(envelope: Envelope, hold: float) -> int:
@@ -159,7 +160,7 @@ def search_envelope(
     hold = problem.schedule.hold * problem.schedule.sample_time
     return exchange_settings(
         problem, envelope, worth, seed, effort=effort, workers=workers,
-        ends=usual_ends(envelope, problem.shape[0], hold),
+        beginnings=usual_beginnings(envelope, problem.shape[0], hold),
     )  # fmt: skip
 
 
@@ -172,7 +173,7 @@ def exchange_settings(
     effort: float = 1.0,
     tries: int = _TOGETHER,
     workers: int | None = None,
-    ends: Array | None = None,
+    beginnings: Array | None = None,
 ) -> EnvelopeSearch:
     """Search for the sequence of settings of an envelope that is worth most.
 
@@ -190,15 +191,15 @@ def exchange_settings(
         Sequences that each round of each chain tries.
     workers : int, optional
         Processes.
-    ends : ndarray, optional
-        (M, E, nc) one of which the sequence ends with; random sequences do not.
+    beginnings : ndarray, optional
+        (M, B, nc) one of which the sequence begins with; random sequences do not.
     """
     holds, nc = problem.shape
-    if ends is None:
-        ends = np.empty((1, 0, nc))
-    free = holds - ends.shape[1]
+    if beginnings is None:
+        beginnings = np.empty((1, 0, nc))
+    begun = beginnings.shape[1]
     hold = problem.schedule.hold * problem.schedule.sample_time
-    longest = max(1, min(free, round(HOLDS[1] * envelope.time_scale / hold)))
+    longest = max(1, min(holds - begun, round(HOLDS[1] * envelope.time_scale / hold)))
 
     def judged(levels: Array) -> list[tuple[Array, Candidate]]:
         out = []
@@ -229,15 +230,15 @@ def exchange_settings(
 
     def moved(levels: Array, rng: np.random.Generator) -> Array:
         out = levels.copy()
-        if len(ends) > 1 and rng.random() < _ENDS_ANEW:
-            out[free:] = ends[rng.integers(len(ends))]
+        if len(beginnings) > 1 and rng.random() < _BEGINS_ANEW:
+            out[:begun] = beginnings[rng.integers(len(beginnings))]
         for _ in range(int(rng.integers(1, 4))):
             held = _held(rng, longest)
-            i = int(rng.integers(free - held + 1))
+            i = int(rng.integers(begun, holds - held + 1))
             if rng.random() < _ANEW:
                 out[i : i + held] = envelope.pick(rng)
             else:
-                j = int(rng.integers(free - held + 1))
+                j = int(rng.integers(begun, holds - held + 1))
                 out[i : i + held], out[j : j + held] = (
                     out[j : j + held].copy(), out[i : i + held].copy(),
                 )  # fmt: skip
@@ -248,16 +249,16 @@ def exchange_settings(
     def better(found: list[tuple[Array, Candidate]]) -> list[tuple[Array, Candidate]]:
         return sorted(found, key=lambda f: (f[1].shortfall(scale), -f[1].value))[:_KEPT]
 
-    begun = judged(drawn(RANDOM, np.random.default_rng([41, seed])))
+    random = judged(drawn(RANDOM, np.random.default_rng([41, seed])))
     rounds = max(2, round(_ROUNDS * effort))
 
     def chain(number: int) -> tuple[Array, Candidate]:
         rng = np.random.default_rng([43, seed, number])
-        pool = better(begun)
-        if ends.shape[1]:
-            ended = np.array([levels for levels, _ in pool])
-            ended[:, free:] = ends[rng.integers(len(ends), size=len(ended))]
-            pool = judged(ended)
+        pool = better(random)
+        if begun:
+            anew = np.array([levels for levels, _ in pool])
+            anew[:, :begun] = beginnings[rng.integers(len(beginnings), size=len(anew))]
+            pool = judged(anew)
         for _ in range(rounds):
             parents = rng.integers(len(pool), size=tries)
             children = np.array([moved(pool[i][0], rng) for i in parents])
@@ -265,9 +266,9 @@ def exchange_settings(
         return pool[0]
 
     found = better(map_forked(chain, range(_CHAINS), workers=workers))
-    values = np.array([c.value for _, c in begun])
+    values = np.array([c.value for _, c in random])
     # the sides that a sequence goes to are no limit of the trial
-    best, reference = (replace(c, missed=c.missed[:-1]) for _, c in (found[0], better(begun)[0]))
+    best, reference = (replace(c, missed=c.missed[:-1]) for _, c in (found[0], better(random)[0]))
     return EnvelopeSearch(best, values, reference, RANDOM + _CHAINS * rounds * tries)
 
 

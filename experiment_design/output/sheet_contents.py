@@ -174,7 +174,9 @@ def _parts_words(design: Design, band: MotionBand) -> str:
     said = [f"{p.name} from {clock(p.begin)} to {clock(p.end)}" for p in own]
     judged = [p for p in own if p.name == VALIDATION]
     if judged:
-        said[-1] += f", {design.share(judged[0]):.0%}, by which an estimate of the rest is judged"
+        said[own.index(judged[0])] += (
+            f", {design.share(judged[0]):.0%}, by which an estimate of the rest is judged"
+        )
     return f" ({', '.join(said)})"
 
 

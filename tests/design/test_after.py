@@ -166,7 +166,7 @@ def test_the_plan_covers_what_has_not_been_sailed(request_, model) -> None:
          for s, d in zip(states, seen.spread, strict=True)]
     )  # fmt: skip
     assert left(after, known) == pytest.approx(told, rel=1e-6)
-    assert left(after, known) < left(alone, known) < left(alone, None)
+    assert left(after, known) < left(alone, known) < left(alone, 0.0)
 
 
 @pytest.fixture(scope="module")

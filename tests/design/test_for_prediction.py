@@ -17,7 +17,7 @@ from experiment_design.for_prediction import (
     prior_misfit,
 )
 from experiment_design.information.envelope import _sensitivities, build_envelope
-from experiment_design.optimise.envelope_search import one_sided, usual_ends, usual_manoeuvres
+from experiment_design.optimise.envelope_search import one_sided, usual_beginnings, usual_manoeuvres
 from greybox.commands.main import main
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
@@ -175,12 +175,12 @@ def test_usual_manoeuvres_go_to_both_sides_at_two_speeds(envelope) -> None:
     assert len(usual_manoeuvres(envelope, 5, hold)) == 5
 
 
-def test_usual_ends_are_zigzags_and_turns_for_a_stated_share(envelope) -> None:
+def test_usual_beginnings_are_zigzags_and_turns_for_a_stated_share(envelope) -> None:
     hold = envelope.time_scale
-    ends = usual_ends(envelope, 100, hold)
-    assert ends.shape[1:] == (15, 3)
+    found = usual_beginnings(envelope, 100, hold)
+    assert found.shape[1:] == (15, 3)
     rate = envelope.steady[
-        [[np.abs(envelope.settings - v).sum(axis=1).argmin() for v in e] for e in ends], 2
+        [[np.abs(envelope.settings - v).sum(axis=1).argmin() for v in e] for e in found], 2
     ]
     for zigzag, turn in zip(rate[::4], rate[2::4], strict=True):
         # legs of three lengths, and the turn is one of them
@@ -189,8 +189,8 @@ def test_usual_ends_are_zigzags_and_turns_for_a_stated_share(envelope) -> None:
         assert zigzag[3] == zigzag[5] != zigzag[6]
         assert len(set(turn)) == 1
     # two legs at least, and never more than a third
-    assert usual_ends(envelope, 24, hold).shape[1] == 6
-    assert usual_ends(envelope, 9, hold).shape[1] == 3
+    assert usual_beginnings(envelope, 24, hold).shape[1] == 6
+    assert usual_beginnings(envelope, 9, hold).shape[1] == 3
 
 
 @pytest.fixture(scope="module")
@@ -224,19 +224,19 @@ def test_a_plan_leaves_less_than_random_sequences(found) -> None:
     assert found.design.motions[0].state[0, :, 0].min() > 0.2 - 1e-3
 
 
-def test_a_trial_ends_with_a_usual_manoeuvre_that_judges_the_estimate(found, envelope) -> None:
-    trial, validation = found.to_dict()["parts"]
-    assert (trial["part"], trial["from"]) == ("trial", 0.0)
-    assert (validation["part"], validation["to"]) == ("validation", 200.0)
-    assert trial["to"] == validation["from"]
+def test_a_trial_begins_with_a_usual_manoeuvre_that_judges_the_estimate(found, envelope) -> None:
+    validation, trial = found.to_dict()["parts"]
+    assert (validation["part"], validation["from"]) == ("validation", 0.0)
+    assert (trial["part"], trial["to"]) == ("trial", 200.0)
+    assert trial["from"] == validation["to"]
     assert found.to_dict()["prediction"]["validation_share"] == validation["share"] <= 1 / 3
-    assert f"the last {validation['share']:.0%} of each trial" in found.summary()
+    assert f"the first {validation['share']:.0%} of each trial" in found.summary()
     r = found.design.request
-    begin = round(validation["from"] / r.sample_time)
+    begin = round(trial["from"] / r.sample_time)
     plan = found.design.to_pandas()
-    assert list(plan["part"]) == ["trial"] * begin + ["validation"] * (len(plan) - begin)
+    assert list(plan["part"]) == ["validation"] * begin + ["trial"] * (len(plan) - begin)
     # one or two settings, of which the ship's own rates may make ramps
-    held = found.design.levels[0][-round((200.0 - validation["from"]) / r.hold) :]
+    held = found.design.levels[0][: round(trial["from"] / r.hold)]
     assert len(np.unique(held.round(6), axis=0)) <= 2
 
 
@@ -323,12 +323,12 @@ def test_options_that_do_not_go_together(files, options, message, capsys) -> Non
 def test_a_start_short_of_its_margins_is_led_in(model) -> None:
     request = request_of(duration=200.0, covariance=None, starts=(np.zeros(4),), effort=0.1)
     found = design_for_prediction(request, model, kept_starts=1)
-    lead, trial, validation = found.to_dict()["parts"]
-    assert [p["part"] for p in (lead, trial, validation)] == ["lead-in", "trial", "validation"]
+    lead, validation, trial = found.to_dict()["parts"]
+    assert [p["part"] for p in (lead, validation, trial)] == ["lead-in", "validation", "trial"]
     assert lead["from"] == 0.0
-    assert lead["to"] == trial["from"] == found.design.lead_in_s > 0
-    assert trial["to"] == validation["from"]
-    assert validation["to"] == pytest.approx(lead["to"] + 200.0)
+    assert lead["to"] == validation["from"] == found.design.lead_in_s > 0
+    assert trial["from"] == validation["to"]
+    assert trial["to"] == pytest.approx(lead["to"] + 200.0)
     # the margin holds behind the lead-in, which begins at rest
     assert found.design.motions[0].state[0, :, 0].min() >= 0.2 - 1e-3
     with pytest.raises(InfeasibleError, match="lead-in"):
