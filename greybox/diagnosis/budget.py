@@ -232,12 +232,18 @@ def error_budget(
     e0, e1 = (
         np.concatenate([_states(p.held, p.held_fit) for p in pairs]) for pairs in (base, final)
     )
-    parts, noise = [], []
-    for pair in final:
-        left = generic_force(pair).errors
-        parts.append(np.concatenate(left))
+    beside = [generic_force(pair).errors for pair in final]
+    rest = np.concatenate([np.concatenate(errors) for errors in beside])[:, : len(names)]
+    # a force that makes held-out runs worse explains nothing of them
+    helps = (rest**2).sum(axis=0) < (e1**2).sum(axis=0)
+    rest = np.where(helps, rest, e1)
+    noise = []
+    for pair, errors in zip(final, beside, strict=True):
+        taken = np.append(helps, np.ones(errors[0].shape[1] - len(names), bool))
+        left = tuple(
+            np.where(taken, e, plain) for e, plain in zip(errors, pair.held_fit.errors, strict=True)
+        )
         noise.append((_noise_of(pair, left), sum(map(len, left))))
-    rest = np.concatenate(parts)[:, : len(names)]
     left_over = {MOTION: e1**2 - rest**2}
     without = {c.id: c.errors for c in causes if len(c.errors)}
     before = {name: e0**2 - errors**2 for name, errors in without.items()} | left_over
