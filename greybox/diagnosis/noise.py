@@ -177,9 +177,8 @@ def _filter(k: int, slopes: bool = False) -> ca.Function:
     move, informed, p = begun(*given)
     for _ in range(_DOUBLINGS):
         move, informed, p = doubled(move, informed, p)
-    found = ended(p, *given)
-    if slopes:
-        found = [ca.jacobian(found[0], given[0])]
+    transfer, *rest = ended(p, *given)
+    found = [ca.jacobian(transfer, given[0])] if slopes else [transfer, *rest]
     return ca.Function("filter", given, found)
 
 
