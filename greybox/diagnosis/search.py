@@ -499,8 +499,8 @@ def _without(problem: Problem, fit: Fit, cause: Candidate) -> Fit:
         cost = problem.whitened(fit.noise, problem.errors(point))[1]
         begun.append((cost, point))
     point = min(begun, key=lambda item: item[0])[1]
-    found = problem.fit(point, fit.noise, most=FIRST, than=fit.cost)
-    return problem.settle(found, 2, than=fit.cost)
+    found = problem.fit(point, fit.noise, most=FIRST)
+    return problem.settle(found, 2, np.inf if found.converged else fit.cost)
 
 
 def _at_null(problem: Problem, fit: Fit, hypothesis: Hypothesis) -> Array:
