@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -29,6 +30,8 @@ _NEAR = 1.0
 _DAMPING_LIMIT = 1e6
 # mean square of a log's errors, in that of all logs, that has a logarithm
 _LEAST_SIZE = 1e-12
+# points and fits whose derivatives and covariances are kept at hand: one, and one beside it
+_KEPT = 2
 # values at which hills of a likelihood are looked for
 _HILLS = 25
 
@@ -110,6 +113,9 @@ class Problem:
         self.groups = groups_of(runs[0])
         self.names = (*self.structure.parameters, *CURRENTS)
         self._known: tuple[Point, list[_Own]] | None = None
+        # of the last points and fits that were asked for: several tests ask for the same
+        self._rows: deque[tuple[Point, Noise, list[Array]]] = deque(maxlen=_KEPT)
+        self._covariances: deque[tuple[Fit, tuple[Array, Array]]] = deque(maxlen=_KEPT)
 
     def place(self, name: str) -> int:
         """Return the index of a coefficient or current."""
@@ -200,9 +206,14 @@ class Problem:
 
     def rows(self, point: Point, noise: Noise) -> list[Array]:
         """Return whitened derivatives of the outputs in the free numbers, (N, ny, q) per log."""
+        for at, weighed_by, found in self._rows:
+            if at is point and weighed_by is noise:
+                return found
         # of a run at the edge of stability the derivatives may leave every number's range
         with np.errstate(over="ignore", invalid="ignore"):
-            return [noise.whiten(slopes) for slopes in self.slopes(point)]
+            made = [noise.whiten(slopes) for slopes in self.slopes(point)]
+        self._rows.append((point, noise, made))
+        return made
 
     def slopes(self, point: Point) -> list[Array]:
         """Return derivatives of the outputs in the free numbers, (N, ny, q) per log."""
@@ -409,6 +420,14 @@ class Problem:
         never less than what white innovations would give; infinite where the derivatives of a
         run at the edge of stability leave every number's range.
         """
+        for of, found in self._covariances:
+            if of is fit:
+                return found
+        made = self._robust_covariance(fit)
+        self._covariances.append((fit, made))
+        return made
+
+    def _robust_covariance(self, fit: Fit) -> tuple[Array, Array]:
         rows = np.concatenate(self.rows(fit.point, fit.noise))
         nu = np.concatenate(fit.nu)
         samples, _, q = rows.shape

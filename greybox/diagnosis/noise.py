@@ -177,9 +177,9 @@ def _filter(k: int, slopes: bool = False) -> ca.Function:
     move, informed, p = begun(*given)
     for _ in range(_DOUBLINGS):
         move, informed, p = doubled(move, informed, p)
-    found: list[ca.MX] = list(ended(p, *given))
-    made = [ca.jacobian(found[0], given[0])] if slopes else found
-    return ca.Function("filter", given, made)
+    transfer, *rest = ended(p, *given)
+    found = [ca.jacobian(transfer, given[0])] if slopes else [transfer, *rest]
+    return ca.Function("filter", given, found)
 
 
 def _riccati(k: int) -> tuple[ca.Function, ca.Function, ca.Function]:

@@ -129,8 +129,8 @@ def promises(
         return replace(at, point=replace(at.point, hypotheses=())), told
 
     plain, *forgetful = [
-        (replace(at, point=fit.point), [Score(hypotheses[k], *promised) for k, *promised in told])
-        for at, told in map_forked(work, [False, *([True] if slow(fit) else [])])
+        (replace(at, point=fit.point), [Score(hypotheses[k], value, gain) for k, value, gain in s])
+        for at, s in map_forked(work, [False, *([True] if slow(fit) else [])])
     ]
     later = [(at, score) for at, scores in forgetful for score in shortlist(scores)[:_SECOND]]
     return plain[1], later

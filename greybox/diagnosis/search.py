@@ -447,26 +447,33 @@ def weighed(case: DiagnosisProblem, found: Search) -> Search:
 def _stood(
     case: DiagnosisProblem, fit: Fit, causes: Sequence[Candidate], tried: int
 ) -> list[tuple[Candidate, Fit]]:
-    """Return causes with what each does beside a generic force, and the fits without them."""
+    """Return causes with what each does beside a generic force, and the fits without them.
+
+    Those whose numbers are told already stand, and come with the fit as it is.
+    """
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     pairs = held_out.pairs(fit)
-    if not any(p.held_fit.escaped or p.fit.escaped for p in pairs):
+    asked = [c for c in causes if c.told is None]
+    if asked and not any(p.held_fit.escaped or p.fit.escaped for p in pairs):
         # once for all of them
         for pair in pairs:
             contributions_beside(pair)
+        problem.covariance(fit)
 
     def work(k: int) -> tuple[Fit, tuple[Standing, Proof]]:
-        without = _without(problem, fit, causes[k])
-        hypothesis = causes[k].hypothesis
+        without = _without(problem, fit, asked[k])
+        hypothesis = asked[k].hypothesis
         weight = standing(problem, hypothesis, fit, pairs, held_out.pairs(without))
         return without, (weight, held_out.prove(without, fit))
 
-    found = on_all_processors([problem.drop(fit.point, c.hypothesis) for c in causes], work)
+    rest = [problem.drop(fit.point, c.hypothesis) for c in asked]
+    found = iter(on_all_processors(rest, work))
     out = []
-    for cause, (without, (weight, proof)) in zip(causes, found, strict=True):
+    for cause in causes:
         if cause.told is not None:
-            out.append((cause, without))
+            out.append((cause, fit))
             continue
+        without, (weight, proof) = next(found)
         alone = assess_candidate(proof, without, fit, cause.hypothesis, tried, cause.names)
         alone = _wald_checked(case, replace(alone, standing=weight))
         out.append((alone, without))
@@ -492,8 +499,8 @@ def _without(problem: Problem, fit: Fit, cause: Candidate) -> Fit:
         cost = problem.whitened(fit.noise, problem.errors(point))[1]
         begun.append((cost, point))
     point = min(begun, key=lambda item: item[0])[1]
-    found = problem.fit(point, fit.noise, most=FIRST, than=fit.cost)
-    return problem.settle(found, 2, than=fit.cost)
+    found = problem.fit(point, fit.noise, most=FIRST)
+    return problem.settle(found, 2, np.inf if found.converged else fit.cost)
 
 
 def _at_null(problem: Problem, fit: Fit, hypothesis: Hypothesis) -> Array:

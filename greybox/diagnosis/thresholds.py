@@ -19,7 +19,7 @@ AS_CHOSEN = 0.16
 # fall of −2 log L a measured number from which on a cause matters: blind, |r|r for r³ gained 0.1 %
 RELEVANT = 0.005
 # share of what the absence of a cause costs below which a step of the fit without it decides
-# nothing: that fit may have no way back to a minimum, and would never end by itself
+# nothing, where that fit found no minimum at first: it would hardly end by itself
 DECIDED = 1e-3
 # causes at most: a fifth has never been right
 MOST_CAUSES = 4

@@ -297,10 +297,11 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
     nu = (nu - left @ (left.T @ nu)) / alike
     moved, _ = _pushed(held, held_fit, knots, any_of, pushers.scales)
     point = replace(fit.point, starts=held_fit.point.starts)
-    shown = held.slopes(point)
-    begun = held.slopes(held_fit.point)
     noise = held_fit.noise
-    starts = _stacked([noise.whiten(s) for s in begun])
+    with np.errstate(over="ignore", invalid="ignore"):
+        shown = held.slopes(point)
+        begun = held.slopes(held_fit.point)
+        starts = _stacked([noise.whiten(s) for s in begun])
     out = []
     for use in uses:
         mine = pushers.used(use)
@@ -308,11 +309,12 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
         delta[mine] = _likeliest(raw[:, mine], nu, pushers, use)
         # what the coefficients give back, where they can imitate
         back = (-((right.T / values) @ (along @ delta)) / scale)[:free]
-        parts = [
-            columns @ (delta / size) + slopes[:, :, :free] @ back
-            for columns, slopes in zip(moved, shown, strict=True)
-        ]
-        whitened = _stacked([noise.whiten(p[:, :, None]) for p in parts])[:, 0]
+        with np.errstate(over="ignore", invalid="ignore"):
+            parts = [
+                columns @ (delta / size) + slopes[:, :, :free] @ back
+                for columns, slopes in zip(moved, shown, strict=True)
+            ]
+            whitened = _stacked([noise.whiten(p[:, :, None]) for p in parts])[:, 0]
         if not (np.isfinite(whitened).all() and np.isfinite(starts).all()):
             out.append(none)
             continue
