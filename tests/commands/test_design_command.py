@@ -90,6 +90,7 @@ def test_plan_and_json(folder, capsys):
     assert "predicted" not in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_start_at_rest_gets_a_lead_in(folder, capsys):
     out, sheet, page = (folder / name for name in ("led.json", "led.html", "page.html"))
     status, plan = run(

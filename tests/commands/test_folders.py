@@ -160,6 +160,7 @@ def test_what_needs_all_samples_is_refused_of_a_stream(folder, capsys, options, 
     assert f"{asked} needs all samples in memory at once" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_structures_are_compared_on_stretches_of_a_stream(folder, tmp_path):
     out = tmp_path / "model.json"
     options = ["--vessel", "thesis", "--method", "iv", "--memory", "0.001", "--json", str(out)]

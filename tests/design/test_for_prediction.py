@@ -240,6 +240,7 @@ def test_a_trial_begins_with_a_usual_manoeuvre_that_judges_the_estimate(found, e
     assert len(np.unique(held.round(6), axis=0)) <= 2
 
 
+@pytest.mark.long
 def test_the_same_request_gives_the_same_plan(found, model) -> None:
     again = design_for_prediction(request_of(duration=200.0, covariance=model.covariance), model)
     assert np.array_equal(again.design.commands[0], found.design.commands[0])

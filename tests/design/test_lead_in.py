@@ -63,6 +63,7 @@ def test_the_trial_goes_on_from_the_last_commands() -> None:
     np.testing.assert_allclose(whole.expand(both)[-s.samples :], s.expand(levels))
 
 
+@pytest.mark.long
 def test_a_design_keeps_rates_and_limits_from_its_first_command_on() -> None:
     limits = {"speed_cap": 2.5, "area": Circle(0.0, 0.0, 300.0)}
     design = design_trial(

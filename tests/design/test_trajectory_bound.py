@@ -122,6 +122,7 @@ def test_no_short_trial_beats_its_bound(ship, small, name, kind):
     assert not bound.relaxed
 
 
+@pytest.mark.long
 def test_limits_on_the_speeds_lower_the_bound(ship, small):
     problem = make_problem(ship, "linear", 60.0, white=True)
     unit = climb(problem, draw_two_level(problem, np.random.default_rng(0), 3), 0, 200).unit

@@ -149,6 +149,7 @@ def test_a_diagnosis_adds_it(trial, validated: bool) -> None:
     assert found.model.record["remainder"]["added"]
 
 
+@pytest.mark.long
 def test_where_nothing_is_missing_nothing_is_added() -> None:
     sailed = draw(np.random.default_rng([3, 11]), samples=600)
     plain = replace(ASKED, remainder=False)

@@ -134,6 +134,7 @@ def test_nothing_changes_where_nothing_is_switched_off(pair: Pair) -> None:
     assert (errors**2).sum(axis=0) == pytest.approx((own**2).sum(axis=0), rel=0.02)
 
 
+@pytest.mark.long
 def test_a_current_takes_what_it_would_if_it_were_not_there() -> None:
     trial = draw(np.random.default_rng([5, 77]), ("current",), samples=900)
     still = draw(np.random.default_rng([5, 77]), ("current",), samples=900, size=0.0)

@@ -177,6 +177,7 @@ def test_a_slow_azimuth_is_named_with_its_place(tmp_path) -> None:
     assert (late.lag, late.lag_on) == (lag["value"], "alpha1")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("effect", "seed"), [("rate_limit", 11), ("feedback_sampling", 6)])
 def test_what_acts_beside_the_log_is_measured(effect: str, seed: int) -> None:
     trial = draw(np.random.default_rng([77, seed]), (effect,), kind="manoeuvres", samples=900)

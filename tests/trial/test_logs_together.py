@@ -41,6 +41,7 @@ def offsets(recordings, ship):
     ]
 
 
+@pytest.mark.long
 def test_instruments_are_estimated_once_over_all_logs(ship):
     recordings = logs_of(range(10, 14), late={"psi": 0.5})
     alone = offsets(recordings[:1], ship)[0]
