@@ -53,8 +53,7 @@ class ConstraintSatisfaction:
         return (
             f"limits are kept with probability {self.probability:.2f} "
             f"({self.lower:.2f} to {self.upper:.2f}) under {self.draws} models drawn from the prior"
-            + " and its misfit"
-            * self.misled
+            + (" and its misfit" if self.misled else "")
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from greybox.errors import InfeasibleError
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.model.run.step import StepModel
-from greybox.numerics.linalg import scaled, trace_with_inverse
+from greybox.numerics.linalg import scaled, sizes, trace_with_inverse
 from greybox.numerics.vectorised import Vectorised
 
 Array = NDArray[np.float64]
@@ -106,6 +106,8 @@ class Envelope:
 
         To first order, beside the primary terms that imitate them best over the envelope.
         """
+        from scipy.interpolate import make_interp_spline
+
         rows, every = _sensitivities(self.rollout, self.predictor, self._features, motion)
         p = len(self.predictor.columns)
         beta = np.random.default_rng(53).standard_normal((draws, len(self._precision) - p))
@@ -115,10 +117,7 @@ class Envelope:
         known = np.minimum(every * np.arange(off.shape[1] + 1), motion.tau.shape[1])
         off = np.pad(off, ((0, 0), (1, 0), (0, 0)))
         at = np.arange(motion.tau.shape[1] + 1)
-        place = np.interp(at, known, np.arange(len(known)))
-        before = np.minimum(place.astype(int), len(known) - 2)
-        share = (place - before)[:, None]
-        return np.asarray((1 - share) * off[:, before] + share * off[:, before + 1])
+        return np.asarray(make_interp_spline(known, off, k=1, axis=1)(at))
 
     def errors(self, motion: Motion, known: Array | float = 0.0) -> tuple[Array, Array]:
         """Return the prediction errors that remain after estimates from R motions.
@@ -419,9 +418,7 @@ def _sensitivities(
 def _imitation(moments: tuple[Array, ...], p: int) -> Array:
     """Return the coefficients (p, q) of the primary terms that imitate each potential one best."""
     total = np.sum(moments, axis=0)
-    size = np.sqrt(np.diag(total))
-    size[size == 0] = 1.0
-    unit = total / np.outer(size, size)
+    size, unit = sizes(total), scaled(total)[0]
     best = np.linalg.solve(unit[:p, :p] + 1e-9 * np.eye(p), unit[:p, p:])
     return np.asarray(best * size[p:] / size[:p, None])
 

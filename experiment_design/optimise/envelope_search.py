@@ -108,7 +108,8 @@ def usual_beginnings(envelope: Envelope, holds: int, hold: float) -> Array:
     for share in _TURNS:
         for fast in (True, False):
             pair = np.array(_to_both_sides(envelope, share, fast=fast))
-            found += [pair[other], pair[1 - other], pair[0 * other], pair[0 * other + 1]]
+            zig_zags = [pair[other], pair[1 - other]]
+            found += [*zig_zags, *(np.tile(turn, (count, 1)) for turn in pair)]
     return np.array(found)
 
 

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.builder import held_runs
+from greybox.diagnosis.evidence.features import through_water
 from greybox.diagnosis.evidence.held_out import Pair
-from greybox.diagnosis.evidence.remainder import through_water
 from greybox.diagnosis.extension import noise_levels, one_step_deviations
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.gain import gains, run_on

@@ -177,6 +177,5 @@ def require_motion(logs: Sequence[TrialLog], structure: Structure) -> None:
         raise ExcitationError(
             f"{', '.join(structure.states)} do not change over the whole log, so the motion does "
             f"not show what the commands do: see whether the columns hold what was measured "
-            f"(greybox "
-            f"check), and give a log in which the ship moves."
+            f"(greybox check), and give a log in which the ship moves."
         )

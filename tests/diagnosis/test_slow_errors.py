@@ -10,8 +10,8 @@ import pytest
 from changing import FACTOR, MOMENT, changed_log, fitted
 
 from greybox.diagnosis.diagnose import diagnose
+from greybox.diagnosis.evidence.features import features, knots_of
 from greybox.diagnosis.evidence.held_out import Pair
-from greybox.diagnosis.evidence.remainder import features, knots_of
 from greybox.diagnosis.noise import fit_noise
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.refitting import loosened

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from greybox.diagnosis.evidence.features import features
 from greybox.diagnosis.evidence.held_out import Proof
 from greybox.diagnosis.evidence.remainder import (
     ANYTHING,
     MOTION_AND_COMMANDS,
     _Pushers,
-    features,
     generic_force,
 )
 from greybox.diagnosis.evidence.standing import Standing, _own_arguments, standing

@@ -14,7 +14,7 @@ from greybox.diagnosis.causes.hull import listed, term_hypothesis
 from greybox.diagnosis.causes.sensors import UNRESOLVED
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.ship import Ship
-from greybox.vessel.vessel import Actuation, DelayOn, LagHeld, LagOn, Thruster
+from greybox.vessel.vessel import Actuation, DelayOn, LagHeld, LagOn
 
 Array = NDArray[np.float64]
 
@@ -82,12 +82,6 @@ def _speeds(context: Context, group: Sequence[int]) -> str:
     return "+".join(dict.fromkeys(context.vessel.thrusters[i].speed for i in group))
 
 
-def _driven_by(thruster: Thruster) -> tuple[str, ...]:
-    """Return the columns that a thruster's force is a function of."""
-    angle = thruster.steered_by
-    return (thruster.speed,) if angle is None else (thruster.speed, angle)
-
-
 class ThrusterGain(Cause):
     """One thruster, or a group of them, weaker or stronger than the others' model says."""
 
@@ -113,7 +107,7 @@ class ThrusterGain(Cause):
                 return ship
 
             parameter = Parameter(f"gain_{thrusters[members[0]].speed}", "1", 0.85, 0.0, most, 1.0)
-            driven = dict.fromkeys(c for i in members for c in _driven_by(thrusters[i]))
+            driven = dict.fromkeys(c for i in members for c in thrusters[i].columns)
             return Hypothesis(
                 self.id, f"{self.id}:{key}", (parameter,), (), apply, arguments=tuple(driven),
                 parity=1,
@@ -357,7 +351,7 @@ class QuadraticThrust(Cause):
                 return ship
 
             parameter = Parameter("quadratic_share", "1", 0.3, 0.0, 1.0)
-            driven = dict.fromkeys(c for i in members for c in _driven_by(thrusters[i]))
+            driven = dict.fromkeys(c for i in members for c in thrusters[i].columns)
             return Hypothesis(
                 self.id, f"{self.id}:{place}" if place else self.id, (parameter,), (), apply,
                 arguments=tuple(driven), place=place, parity=1,
@@ -407,7 +401,7 @@ class AngleOffset(Cause):
             key = f"{self.id}:{column}:{i}"
             out.append(
                 Hypothesis(
-                    self.id, key, (parameter,), (), apply, arguments=_driven_by(thruster),
+                    self.id, key, (parameter,), (), apply, arguments=thruster.columns,
                     parity=-1,
                 )
             )  # fmt: skip

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.diagnosis.evidence.features import parity
 from greybox.diagnosis.evidence.held_out import Pair, Proof, proof_of
 from greybox.diagnosis.evidence.remainder import (
     MOTION_AND_COMMANDS,
@@ -15,7 +16,6 @@ from greybox.diagnosis.evidence.remainder import (
     contributions_beside,
     fit_generic_forces,
     generic_force,
-    parity,
 )
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
