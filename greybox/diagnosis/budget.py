@@ -172,17 +172,23 @@ def _nearest(runs: Sequence[LogRun], held: Sequence[LogRun], begun: Sequence[Poi
 
     Errors are weighed by their size: a fit that is weighed by their colour forgets what is slow
     in them, and where much is missing it may end with runs that are farther off than no motion.
+    Where none of them predicts within bounds, the first point's coefficients are kept.
     """
     problem, other = Problem(runs, "free run"), Problem(held, "free run")
-    found = []
-    for point in begun:
-        errors = problem.errors(point)
-        if not all(np.isfinite(e).all() for e in errors):
-            continue
-        fit = problem.settle(problem.fit(point, problem.noise_of(errors, point)), 2)
+    found: list[Pair] = []
+
+    def add(fit: Fit) -> None:
         shown = fit if fit.escaped else other.fit_starts(fit.point, fit.noise)
         if not shown.escaped:
             found.append(Pair(problem, fit, other, shown))
+
+    tried = [(point, problem.errors(point)) for point in begun]
+    bounded = [(p, errors) for p, errors in tried if all(np.isfinite(e).all() for e in errors)]
+    for point, errors in bounded:
+        add(problem.settle(problem.fit(point, problem.noise_of(errors, point)), 2))
+    if not found and bounded:
+        point, errors = bounded[0]
+        add(problem.fit(point, problem.noise_of(errors, point), most=0))
     # a fit may end before a hill beyond which it would predict better
     return min(
         found,

@@ -420,7 +420,7 @@ def weighed(case: DiagnosisProblem, found: Search) -> Search:
     """Return the search without causes that do not stand beside a generic force.
 
     The least of them goes first: what it imitated may be another's once it is gone. Terms
-    without which held-out runs are worse stay in the model, and lose their name.
+    without which held-out runs are worse than those of all stay in the model, and lose their name.
     """
     fit, leaning = found.final, []
     stood = _stood(case, fit, found.causes, found.tried)
@@ -428,7 +428,7 @@ def weighed(case: DiagnosisProblem, found: Search) -> Search:
         least, without = min(fallen, key=lambda item: _beyond(item[0]))
         leaning.append(least)
         stood = [item for item in stood if item[0] is not least]
-        if _needed(case, fit, without):
+        if _needed(case, found.final, without):
             continue
         kept = [cause for cause, _ in stood]
         if without.escaped:

@@ -14,7 +14,7 @@ from greybox.report.figures import comparison_figure, to_svg
 from greybox.report.page import NextStep, Page, Picture, Table, computed, typed
 from greybox.report.thinning import points_for
 from greybox.validation.bands import LEVEL
-from greybox.validation.comparison import Comparison
+from greybox.validation.comparison import Comparison, rmse_titles
 from greybox.validation.fit import mean_fit
 
 _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
@@ -62,8 +62,8 @@ def comparison_page(
                 )
     tables = [
         Table(
-            "Fit (6.12) of the free run [%] and root mean square error [m/s, rad/s]",
-            ["model", "log", *[f"fit {s}" for s in states], *[f"rmse {s}" for s in states]],
+            "Fit (6.12) of the free run and root mean square error",
+            ["model", "log", *[f"fit {s} [%]" for s in states], *rmse_titles(states)],
             fit_rows,
         ),
         Table(

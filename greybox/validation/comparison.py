@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.channels import CHANNELS
 from greybox.errors import UsageError, suggestion
 from greybox.estimation.result import Estimate
 from greybox.model.model import ManoeuvringModel
@@ -54,6 +55,11 @@ class SignTest:
             f"{self.model} fits {self.state} better than {self.against} in {self.wins} of "
             f"{self.of} (p = {self.p_value:.2g})."
         )
+
+
+def rmse_titles(states: Iterable[str]) -> list[str]:
+    """Return the headings of columns of root mean square errors, with their units."""
+    return [f"rmse {s} [{CHANNELS[s].unit}]" for s in states]
 
 
 @dataclass(frozen=True, repr=False)
@@ -155,14 +161,14 @@ class Comparison(DisplayMixin):
         lines = [
             f"{'model':<24}{'log':<26}"
             + "".join(f"{'fit ' + s + ' [%]':>12}" for s in states)
-            + "".join(f"{'rmse ' + s:>11}" for s in states)
+            + "".join(f"{title:>15}" for title in rmse_titles(states))
         ]
         for name, row, errors in zip(self.names, self.runs, self.rmse, strict=True):
             for run, rmse in zip(row, errors, strict=True):
                 lines.append(
                     f"{name[:23]:<24}{run.log.name[:25]:<26}"
                     + "".join(f"{run.fit[s]:>12.1f}" for s in states)
-                    + "".join(f"{rmse[s]:>11.3g}" for s in states)
+                    + "".join(f"{rmse[s]:>15.3g}" for s in states)
                     + (f"  diverged at sample {run.diverged}" if run.diverged >= 0 else "")
                 )
             if len(row) > 1:
@@ -176,7 +182,7 @@ class Comparison(DisplayMixin):
                     s: np.sqrt(np.mean([a[horizon][s] ** 2 for a in aheads if horizon in a]))
                     for s in states
                 }
-                shown = ", ".join(f"{s} {e:.3g}" for s, e in error.items())
+                shown = ", ".join(f"{s} {e:.3g} {CHANNELS[s].unit}" for s, e in error.items())
                 lines.append(f"{name[:23]:<24}{horizon} s ahead, rms error: {shown}")
         lines += self._covered()
         lines += [
@@ -226,7 +232,7 @@ class Comparison(DisplayMixin):
             for name, row, errors in zip(self.names, self.runs, self.rmse, strict=True)
             for run, rmse in zip(row, errors, strict=True)
         ]
-        head = ["model", "log", *(f"fit {s} [%]" for s in states), *(f"rmse {s}" for s in states)]
+        head = ["model", "log", *(f"fit {s} [%]" for s in states), *rmse_titles(states)]
         several = len(self.runs[0]) > 1
         return (
             table([*head, f"{states[0]}: measured, simulated"], rows),
