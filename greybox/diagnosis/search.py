@@ -419,29 +419,46 @@ def _needed(case: DiagnosisProblem, fit: Fit, without: Fit) -> bool:
 def weighed(case: DiagnosisProblem, found: Search) -> Search:
     """Return the search without causes that do not stand beside a generic force.
 
-    The least of them goes first: what it imitated may be another's once it is gone. Terms
-    without which held-out runs are worse stay in the model, and lose their name.
+    The least of them goes first: what it imitated may be another's once it is gone. Those that
+    stood are asked again once none of the others falls. Terms without which held-out runs are
+    worse stay in the model, and lose their name.
     """
     fit, leaning = found.final, []
-    stood = _stood(case, fit, found.causes, found.tried)
-    while fallen := [(cause, without) for cause, without in stood if not _stands(cause)]:
+    waiting = list(found.causes)
+    stood: list[tuple[Candidate, Fit]] = []
+    while True:
+        fallen = [(cause, without) for cause, without in stood if not _stands(cause)]
+        if not fallen:
+            if not waiting:
+                break
+            stood += _stood(case, fit, waiting, found.tried)
+            waiting = []
+            continue
         least, without = min(fallen, key=lambda item: _beyond(item[0]))
         leaning.append(least)
         stood = [item for item in stood if item[0] is not least]
         if _needed(case, fit, without):
             continue
-        kept = [cause for cause, _ in stood]
         if without.escaped:
             # what does not stand holds the run within bounds: nothing of it can be told
+            kept = _as_found(found, [*waiting, *(cause for cause, _ in stood)])
             return replace(found, final=found.base, causes=(), leaning=(*leaning, *kept))
         fit = case.problem(fit.integrator).settle(without, SETTLE)
-        stood = _stood(case, fit, kept, found.tried)
+        waiting += [cause for cause, _ in stood if _stands(cause)]
+        fallen = [cause for cause, _ in stood if not _stands(cause)]
+        stood = _stood(case, fit, fallen, found.tried)
     return replace(
         found,
         final=fit,
-        causes=tuple(cause for cause, _ in stood),
+        causes=tuple(_as_found(found, [cause for cause, _ in stood])),
         leaning=tuple(leaning),
     )
+
+
+def _as_found(found: Search, causes: Sequence[Candidate]) -> list[Candidate]:
+    """Return causes in the order in which they were found."""
+    order = [c.hypothesis.key for c in found.causes]
+    return sorted(causes, key=lambda c: order.index(c.hypothesis.key))
 
 
 def _stood(
