@@ -99,6 +99,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets
     from greybox.model.catalogue import get_structure, structure_for
     from greybox.model.model import load_model
+    from greybox.numerics.memory import keep_freed_memory
     from greybox.report.page import typed
     from greybox.selection.estimate_stream import BYTES
     from greybox.selection.stretches import draw
@@ -108,6 +109,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.out, options.json, options.report)
+    keep_freed_memory()
     vessel = load_vessel(options.vessel)
     model = load_model(options.model).coefficient_model() if options.model else None
     structure = get_structure(options.structure) if model is None else model.structure
