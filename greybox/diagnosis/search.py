@@ -445,8 +445,8 @@ def weighed(case: DiagnosisProblem, found: Search) -> Search:
             return replace(found, final=found.base, causes=(), leaning=(*leaning, *kept))
         fit = case.problem(fit.integrator).settle(without, SETTLE)
         waiting += [cause for cause, _ in stood if _stands(cause)]
-        fallen = [cause for cause, _ in stood if not _stands(cause)]
-        stood = _stood(case, fit, fallen, found.tried)
+        others = [cause for cause, _ in stood if not _stands(cause)]
+        stood = _stood(case, fit, others, found.tried)
     return replace(
         found,
         final=fit,

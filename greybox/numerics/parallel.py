@@ -185,6 +185,52 @@ def map_forked(
     return list(_by_copies(function, pieces, count))
 
 
+@contextmanager
+def ahead(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
+    """Let a copy of this process compute what may be needed later, while this one goes on.
+
+    Where a process cannot be copied, or a cluster computes, it is computed once it is asked for.
+
+    Parameters
+    ----------
+    function : callable
+        Its result must be picklable.
+
+    Yields
+    ------
+    callable
+        Waits for the result and returns it. What was not asked for ends with the block.
+    """
+    if _cluster() is not None or lanes() < 2:
+        yield function
+        return
+    context = multiprocessing.get_context("fork")
+    received, sent = context.Pipe(duplex=False)
+
+    def work(first: int) -> None:
+        _begin_worker(first)
+        sent.send(function())
+
+    copy = context.Process(target=work, args=(os.getpid(),), daemon=True)
+    copy.start()
+    sent.close()
+
+    def result() -> Result:
+        try:
+            found: Result = received.recv()
+        except EOFError:
+            # what went wrong there is told here
+            return function()
+        return found
+
+    try:
+        yield result
+    finally:
+        copy.terminate()
+        copy.join()
+        received.close()
+
+
 def _by_copies(
     function: Callable[[Piece], Result], pieces: Sequence[Piece], count: int
 ) -> Iterator[Result]:
