@@ -99,7 +99,8 @@ class ProjectedScores:
             (m,) products with the innovations, and squares without and with nuisance.
         """
         others = np.column_stack([self.basis, self.nu])
-        across, before, first = 0.0, 0.0, 0
+        size, first = columns[0].shape[2], 0
+        across, before = np.zeros((size, others.shape[1])), np.zeros(size)
         with np.errstate(over="ignore", invalid="ignore"):
             for part in columns:
                 samples, channels, _ = part.shape
@@ -107,10 +108,9 @@ class ProjectedScores:
                 first += samples * channels
                 # time is last in memory
                 for i, channel in enumerate(self.noise.whiten(part).transpose(1, 2, 0)):
-                    across = across + channel @ beside[:, i]
-                    before = before + np.einsum("mt,mt->m", channel, channel)
-        across, before = np.asarray(across), np.asarray(before)
-        return across[:, -1], before - (across[:, :-1] ** 2).sum(axis=1), before
+                    across += channel @ beside[:, i]
+                    before += np.einsum("mt,mt->m", channel, channel)
+            return across[:, -1], before - (across[:, :-1] ** 2).sum(axis=1), before
 
     def gain(
         self, cleared: Array, before: Array, bounds: Array | None = None
