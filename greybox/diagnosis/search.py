@@ -29,7 +29,6 @@ from greybox.diagnosis.refitting import (
     likelier,
     on_all_processors,
     promises,
-    refit,
     refits,
     shortlist,
 )
@@ -548,12 +547,15 @@ def instead(
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     rest = problem.drop(fit.point, best.hypothesis)
     without = problem.settle(problem.fit(rest, fit.noise, most=FIRST), 1)
-    out = []
+    asked = []
     for other in others[:_INSTEAD]:
         k = [a.key for a in other.fit.point.hypotheses].index(other.hypothesis.key)
         value = other.fit.point.values[k]
-        found = refit(problem, without, Score(other.hypothesis, value, other.gain))
-        proof = held_out.prove(without, found)
-        out.append(assess_candidate(proof, without, found, other.hypothesis, 1))
+        asked.append((without, Score(other.hypothesis, value, other.gain)))
+    held_out.contributions(without)
+    fits = refits(problem, asked, lambda found: held_out.prove(without, found))
+    out = [
+        assess_candidate(proof, without, found, hypothesis, 1) for hypothesis, found, proof in fits
+    ]
     proof = held_out.prove(without, fit)
     return without, assess_candidate(proof, without, fit, best.hypothesis, 1), out

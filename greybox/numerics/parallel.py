@@ -18,6 +18,7 @@ from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExec
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from functools import cache
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -199,17 +200,19 @@ def ahead(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
     Yields
     ------
     callable
-        Waits for the result and returns it. What was not asked for ends with the block.
+        Waits for the result and returns it, each time the same. What was not asked for ends with
+        the block.
     """
     if _cluster() is not None or lanes() < 2:
-        yield function
+        yield cache(function)
         return
     context = multiprocessing.get_context("fork")
     received, sent = context.Pipe(duplex=False)
 
     def work(first: int) -> None:
         _begin_worker(first)
-        sent.send(function())
+        with suppress(Exception):
+            sent.send(function())
 
     copy = context.Process(target=work, args=(os.getpid(),), daemon=True)
     copy.start()
@@ -219,12 +222,12 @@ def ahead(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
         try:
             found: Result = received.recv()
         except EOFError:
-            # what went wrong there is told here
+            # what went wrong there goes wrong here, too, and is told
             return function()
         return found
 
     try:
-        yield result
+        yield cache(result)
     finally:
         copy.terminate()
         copy.join()
