@@ -36,7 +36,7 @@ from foreign_ships.ship import Faults  # type: ignore[import-not-found]
 from foreign_ships.simulate import Trial  # type: ignore[import-not-found]
 
 from greybox import diagnose, load_vessel, read_log
-from greybox.diagnosis.budget import nearest
+from greybox.diagnosis.budget import errors_before
 from greybox.diagnosis.preparing import prepare
 from greybox.numerics.binomial import wilson_interval
 from greybox.selection.estimate import estimate_model
@@ -189,8 +189,7 @@ def squares(logs: Sequence[TrialLog]) -> np.ndarray[Any, np.dtype[np.float64]]:
     ready = prepare(logs[:-HELD_OUT], logs[-HELD_OUT:], None, "thesis", None)
     base = ready.base()
     pairs = ready.case.held_out(base.integrator).pairs(base)
-    (found,) = nearest(pairs, base, ready.case.first)
-    errors = np.concatenate([e[:, :3] for e in found.held_fit.errors])
+    errors = errors_before(pairs, base, ready.case.first)
     return np.asarray((errors**2).mean(axis=0))
 
 

@@ -92,6 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Read, diagnose, report, write."""
     from dataclasses import replace
+    from functools import partial
     from pathlib import Path
     from shlex import quote
 
@@ -99,6 +100,8 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets
     from greybox.model.catalogue import get_structure, structure_for
     from greybox.model.model import load_model
+    from greybox.numerics.memory import keep_freed_memory
+    from greybox.numerics.parallel import ahead
     from greybox.report.page import typed
     from greybox.selection.estimate_stream import BYTES
     from greybox.selection.stretches import draw
@@ -108,28 +111,31 @@ def run(options: argparse.Namespace) -> None:
     from greybox.vessel.toml import load_vessel
 
     check_targets(options.out, options.json, options.report)
+    keep_freed_memory()
     vessel = load_vessel(options.vessel)
     model = load_model(options.model).coefficient_model() if options.model else None
     structure = get_structure(options.structure) if model is None else model.structure
     sample_time = options.sample_time or (model.sample_time if model else None)
-    validate, also = read_logs(options.validate, vessel, sample_time, structure.states)
-    files = find_logs(options.logs)
     told: dict[str, Any] = {}
-    if estimated_rows(files) * BYTES <= options.memory * 2**30:
-        logs, left_out = read_logs(options.logs, vessel, sample_time, structure.states)
-    else:
-        stream = open_stream(files, vessel, states=structure.states, sample_time=sample_time)
-        if model is None:
-            structure = structure_for(options.structure, force_inputs(vessel))
-        drawn = draw(stream, structure)
-        drawn.require_others(validate)
-        logs, left_out = list(drawn.logs), (*drawn.stream.left_out, _drawn_from(drawn))
-        told["stream"] = {
-            "files": len(drawn.stream.parts),
-            "rows": drawn.stream.rows,
-            "left_out": list(drawn.stream.left_out),
-            "drawn": drawn.to_dict(["diagnosis"]),
-        }
+    given = (vessel, sample_time, structure.states)
+    with ahead(partial(read_logs, options.validate, *given)) as held_out:
+        files = find_logs(options.logs)
+        if estimated_rows(files) * BYTES <= options.memory * 2**30:
+            logs, left_out = read_logs(options.logs, *given)
+        else:
+            stream = open_stream(files, vessel, states=structure.states, sample_time=sample_time)
+            if model is None:
+                structure = structure_for(options.structure, force_inputs(vessel))
+            drawn = draw(stream, structure)
+            drawn.require_others(held_out()[0])
+            logs, left_out = list(drawn.logs), (*drawn.stream.left_out, _drawn_from(drawn))
+            told["stream"] = {
+                "files": len(drawn.stream.parts),
+                "rows": drawn.stream.rows,
+                "left_out": list(drawn.stream.left_out),
+                "drawn": drawn.to_dict(["diagnosis"]),
+            }
+        validate, also = held_out()
     diagnosis = diagnose(
         logs,
         model=model,

@@ -58,10 +58,12 @@ class SwitchedOff:
     relative: float
 
 
-def nearest(
+def errors_before(
     pairs: Sequence[Pair], before: Fit, first: Callable[[Sequence[TrialLog]], Mapping[str, float]]
-) -> list[Pair]:
-    """Return the model without causes where its free runs follow the logs as nearly as they can.
+) -> Array:
+    """Return the held-out errors of the model without causes.
+
+    Its free runs follow the logs as nearly as they can.
 
     Parameters
     ----------
@@ -74,14 +76,15 @@ def nearest(
 
     Returns
     -------
-    list of Pair
-        Empty where a run leaves every bound.
+    ndarray
+        (N, nx), of all that is held out; empty where a run leaves every bound.
     """
     found = [
         _nearest(p.problem.runs, p.held.runs, _starts(p.problem.runs, before, None, first))
         for p in pairs
     ]
-    return [p for p in found if p is not None] if all(found) else []
+    errors = [_states(p.held, p.held_fit) for p in found if p is not None]
+    return np.concatenate(errors) if errors and all(found) else np.zeros((0, 0))
 
 
 def errors_without(
@@ -198,7 +201,7 @@ def _nearest(runs: Sequence[LogRun], held: Sequence[LogRun], begun: Sequence[Poi
 
 
 def error_budget(
-    base: Sequence[Pair],
+    base: Array,
     final: Sequence[Pair],
     causes: Sequence[SwitchedOff],
     terms: Array | None,
@@ -209,9 +212,10 @@ def error_budget(
 
     Parameters
     ----------
-    base, final : sequence of Pair
-        The model without causes as `nearest` returns it, and with those that stand, on what is
-        held out.
+    base : ndarray
+        (N, nx) errors of the model without causes, as of `errors_before`.
+    final : sequence of Pair
+        The model with those that stand, on what is held out.
     causes : sequence of SwitchedOff
     terms : ndarray or None
         (N, nx), as `errors_without`, without the extended model's terms that stand for no cause;
@@ -230,14 +234,11 @@ def error_budget(
         beyond the sensors' noise goes with the error without the cause, or against it, as may
         be; empty where a run leaves every bound.
     """
-    every = [*base, *final]
-    if not base or any(p.fit.escaped or p.held_fit.escaped for p in every):
+    if not len(base) or any(p.fit.escaped or p.held_fit.escaped for p in final):
         return ()
     problem = final[0].held
     names = problem.structure.states
-    e0, e1 = (
-        np.concatenate([_states(p.held, p.held_fit) for p in pairs]) for pairs in (base, final)
-    )
+    e0, e1 = base, np.concatenate([_states(p.held, p.held_fit) for p in final])
     beside = [generic_force(pair).errors for pair in final]
     rest = np.concatenate([np.concatenate(errors) for errors in beside])[:, : len(names)]
     # a force that makes held-out runs worse explains nothing of them

@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.budget import Drop, SwitchedOff, error_budget, errors_without, nearest
+from greybox.diagnosis.budget import (
+    Drop,
+    SwitchedOff,
+    error_budget,
+    errors_before,
+    errors_without,
+)
 from greybox.diagnosis.causes import Cause
 from greybox.diagnosis.evidence.confusion import rivals
 from greybox.diagnosis.evidence.held_out import Pair
@@ -161,9 +167,7 @@ class DiagnosisBuilder:
         found, held_out = self.found, self.case.held_out
         problem = self.case.problem(final.integrator)
         pairs = held_out(final.integrator).pairs(final)
-        base = nearest(
-            held_out(found.before.integrator).pairs(found.before), found.before, self.case.first
-        )
+        diagnosed = held_out(found.before.integrator).pairs(found.before)
         if any(p.fit.escaped or p.held_fit.escaped for p in pairs):
             return ()
 
@@ -171,8 +175,13 @@ class DiagnosisBuilder:
         nameless = self._nameless(final)
         if nameless:
             drops.append(partial(_at_zero, nameless))
-        without = map_forked(
-            lambda drop: errors_without(pairs, found.before, drop, self.case.first), drops
+        before, first = found.before, self.case.first
+        base, *without = map_forked(
+            lambda errors: errors(),
+            [
+                partial(errors_before, diagnosed, before, first),
+                *(partial(errors_without, pairs, before, drop, first) for drop in drops),
+            ],
         )
         causes = map(
             SwitchedOff,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,11 @@ _QUADRATIC = "quadratic_thrust"
 
 
 def from_chosen(
-    ready: Prepared, searched: Search, found: Search, progress: Callable[[str], None]
+    ready: Prepared,
+    searched: Search,
+    found: Search,
+    begun: Callable[[], TermChoice | None],
+    progress: Callable[[str], None],
 ) -> tuple[DiagnosisProblem, Search] | None:
     """Search with errors weighed by their size alone; None where that predicts no better.
 
@@ -56,15 +61,14 @@ def from_chosen(
         Without a model of its own.
     searched, found : Search
         From (3.51), before and after its causes were weighed.
+    begun : callable
+        Returns the choice of terms (`choice_of`) of the logs as they are.
     progress : callable
     """
     progress("terms that the data choose")
     late = _late(ready.case, found)
     ready = replace(ready, case=ready.case.acting(found.final.point.ship.vessel)) if late else ready
-    try:
-        choice = _choice(ready.case.logs)
-    except GreyboxError:
-        choice = None
+    choice = choice_of(ready.case.logs) if late else begun()
     terms = () if choice is None else choice.terms.structure.parameters
     case = ready.case.wider(terms, "free run")
     base = case.carried(found.base)
@@ -165,11 +169,18 @@ def _bounded(case: DiagnosisProblem, starts: Sequence[Point], noise: Noise) -> l
     return best
 
 
-def _choice(logs: Sequence[TrialLog]) -> TermChoice:
-    def none(_: Sequence[TrialLog]) -> None:
-        raise ExcitationError("no model stands before.")
+def choice_of(logs: Sequence[TrialLog]) -> TermChoice | None:
+    """Return the terms that logs choose; None where they choose none."""
+    try:
+        found = select_terms(logs, "no model", 0, Refit(_none))
+    except GreyboxError:
+        return None
+    # what can be sent from one process to another
+    return replace(found, again=_none)
 
-    return select_terms(logs, "no model", 0, Refit(none))  # type: ignore[arg-type]
+
+def _none(_: Sequence[TrialLog]) -> NoReturn:
+    raise ExcitationError("no model stands before.")
 
 
 def _nearer(case: DiagnosisProblem, fit: Fit, other: Fit) -> bool:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from greybox.diagnosis.black_box import with_remainder
 from greybox.diagnosis.builder import DiagnosisBuilder
-from greybox.diagnosis.chosen import from_chosen
+from greybox.diagnosis.chosen import choice_of, from_chosen
 from greybox.diagnosis.evidence.kinematics import causes_of, denied
 from greybox.diagnosis.preparing import SHORTEST, prepare
 from greybox.diagnosis.result import Diagnosis
@@ -18,6 +20,7 @@ from greybox.diagnosis.ruling import leaves_more
 from greybox.diagnosis.search import search, weighed
 from greybox.diagnosis.waves import find_waves, found_waves
 from greybox.model.model import ManoeuvringModel
+from greybox.numerics.parallel import ahead
 from greybox.public import known_keywords, one_thread
 from greybox.regression.regression import common_sample_time
 from greybox.selection.estimate import at_own_pace
@@ -118,34 +121,37 @@ def diagnose(
         logs, validate = _at_own_pace(logs, validate, paced)
     ready = prepare(logs, validate, model, options.structure, options.causes)
     case = ready.case
-    say("model without causes")
-    base = ready.base()
-    problem = case.problem(base.integrator)
-    searched = search(
-        case, base, ready.hypotheses, progress=options.progress, alone=model is not None
-    )
-    say("a generic force beside the causes")
-    found = weighed(case, searched)
-    keys = [c.hypothesis.key for c in found.causes]
-    apart = sorted(key for key in keys if denied(key, ready.agreeing))
-    more = leaves_more(found, case.held_out)
-    if apart and more:
-        # a defect that all sensors share would leave nothing; this one imitates what forces do
-        say("causes without those that the sensors deny")
+    # most models turn out to need it, and not every search keeps all processors busy
+    begun = ahead(partial(choice_of, case.logs)) if model is None else nullcontext(lambda: None)
+    with begun as choice:
+        say("model without causes")
+        base = ready.base()
+        problem = case.problem(base.integrator)
         searched = search(
-            case, base, ready.of_forces, progress=options.progress, alone=model is not None
+            case, base, ready.hypotheses, progress=options.progress, alone=model is not None
         )
+        say("a generic force beside the causes")
         found = weighed(case, searched)
+        keys = [c.hypothesis.key for c in found.causes]
+        apart = sorted(key for key in keys if denied(key, ready.agreeing))
         more = leaves_more(found, case.held_out)
-    found = replace(found, given=ready.as_given())
-    if model is None and more:
-        chosen = from_chosen(ready, searched, found, say)
-        if chosen is not None:
-            wider, mine = chosen
-            mine = weighed(wider, mine)
-            if mine.causes or not found.causes:
-                case, found = wider, mine
-                problem = case.problem(found.base.integrator)
+        if apart and more:
+            # a defect that all sensors share would leave nothing; this one imitates what forces do
+            say("causes without those that the sensors deny")
+            searched = search(
+                case, base, ready.of_forces, progress=options.progress, alone=model is not None
+            )
+            found = weighed(case, searched)
+            more = leaves_more(found, case.held_out)
+        found = replace(found, given=ready.as_given())
+        if model is None and more:
+            chosen = from_chosen(ready, searched, found, choice, say)
+            if chosen is not None:
+                wider, mine = chosen
+                mine = weighed(wider, mine)
+                if mine.causes or not found.causes:
+                    case, found = wider, mine
+                    problem = case.problem(found.base.integrator)
     say("what is left")
     names, final = problem.runs[0].outputs, found.final
     lines = []

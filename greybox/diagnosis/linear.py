@@ -61,7 +61,7 @@ class Slopes:
 
     Those of a step of several stages follow from the rate's at the middle of the step, as the
     exponential of its Jacobian to third order: right to the second power of the step's length.
-    Where that is long for what the rate does, they are carried through every stage.
+    At samples where that is long for what the rate does, they are carried through every stage.
 
     Parameters
     ----------
@@ -104,26 +104,30 @@ class Slopes:
         """
         nx, euler = self._states, self._step.integrator == "euler"
         at = x[:-1] if euler else (x[:-1] + x[1:]) / 2
-        given = (drivers, theta, np.concatenate([np.arange(nx), nx + np.asarray(places, int)]))
-        state, driven = np.split(self._rates(at, *given)[1], [nx], axis=2)
+        own = theta[..., self._active]
+        given = (drivers[:-1], own if own.ndim == 1 else own[:-1])
+        columns = np.concatenate([np.arange(nx), nx + np.asarray(places, int)])
+        state, driven = np.split(self._rates(at, *given, columns)[1], [nx], axis=2)
         if not self._step.structure.increment:
             return Linear(state, driven)
         one = np.eye(nx)
         if euler:
             return Linear(one + state, driven)
-        if np.abs(state).sum(axis=2).max(initial=0.0) > _LONG:
-            return self._through_stages(x[:-1], *given)
         ahead = one + state @ (one / 2 + state / 6)
-        return Linear(one + state @ ahead, ahead @ driven)
+        moved = Linear(one + state @ ahead, ahead @ driven)
+        far = np.abs(state).sum(axis=2).max(axis=1) > _LONG
+        if far.any():
+            exact = self._through_stages(x[:-1][far], *_of_rows(given, far), columns)
+            moved.a[far], moved.driven[far] = exact.a, exact.driven
+        return moved
 
     def _rates(
-        self, at: Array, drivers: Array, theta: Array, columns: NDArray[np.int_]
+        self, at: Array, drivers: Array, own: Array, columns: NDArray[np.int_]
     ) -> tuple[Array, Array]:
-        """Return the rate (N−1, nx) at states (N−1, nx), and its derivatives (N−1, nx, columns)."""
+        """Return the rate (N, nx) at states (N, nx), and its derivatives (N, nx, columns)."""
         nx, steps = self._states, len(at)
-        values: list[Array | float] = [*at.T.copy(), *drivers[:-1].T.copy()]
-        own = theta[..., self._active]
-        values += list(map(float, own)) if own.ndim == 1 else list(own[:-1].T.copy())
+        values: list[Array | float] = [*at.T.copy(), *drivers.T.copy()]
+        values += list(map(float, own)) if own.ndim == 1 else list(own.T.copy())
         wanted = (np.arange(nx)[:, None] * self._columns + columns).ravel()
         rows = np.concatenate([wanted, nx * self._columns + np.arange(nx)])
         out = self._program(values, np.empty((len(rows), steps)), wanted=rows.tolist())
@@ -131,13 +135,13 @@ class Slopes:
         return out[-nx:].T, np.ascontiguousarray(slopes)
 
     def _through_stages(
-        self, x: Array, drivers: Array, theta: Array, columns: NDArray[np.int_]
+        self, x: Array, drivers: Array, own: Array, columns: NDArray[np.int_]
     ) -> Linear:
-        """Return the derivatives of steps from states (N−1, nx), exactly."""
+        """Return the derivatives of steps from states (N, nx), exactly."""
         nx, size = self._states, len(columns)
 
         def slope(full: Array) -> Array:
-            rate, slopes = self._rates(full[:, :, 0], drivers, theta, columns)
+            rate, slopes = self._rates(full[:, :, 0], drivers, own, columns)
             moved = slopes[:, :, :nx] @ full[:, :, 1:]
             moved[:, :, nx:] += slopes[:, :, nx:]
             return np.concatenate([rate[:, :, None], moved], axis=2)
@@ -152,6 +156,12 @@ class Slopes:
         )
         after = self._step.moved(slope, start)
         return Linear(*map(np.ascontiguousarray, (after[:, :, 1 : 1 + nx], after[:, :, 1 + nx :])))
+
+
+def _of_rows(given: tuple[Array, Array], rows: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return drivers, and coefficients that may change along the run, at some of its samples."""
+    drivers, own = given
+    return drivers[rows], own if own.ndim == 1 else own[rows]
 
 
 @lru_cache(maxsize=128)

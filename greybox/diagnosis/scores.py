@@ -8,18 +8,18 @@ along it ranks the causes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
-from greybox.diagnosis.linear import sensitivities
 from greybox.diagnosis.noise import Noise
 from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.point import Fit, Point
 from greybox.numerics.linalg import tall_svd
+from greybox.numerics.recursion import propagate
 
 Array = NDArray[np.float64]
 
@@ -84,6 +84,33 @@ class ProjectedScores:
         """
         rows = _stacked([self.noise.whiten(c) for c in columns])
         return self._clear(rows), (rows**2).sum(axis=0)
+
+    def alone(self, columns: Sequence[Array]) -> tuple[Array, Array, Array]:
+        """Return of whitened columns, each by itself, what `clear` leaves to tell.
+
+        Parameters
+        ----------
+        columns : sequence of ndarray
+            (N, ny, m) of each log.
+
+        Returns
+        -------
+        tuple of ndarray
+            (m,) products with the innovations, and squares without and with nuisance.
+        """
+        others = np.column_stack([self.basis, self.nu])
+        size, first = columns[0].shape[2], 0
+        across, before = np.zeros((size, others.shape[1])), np.zeros(size)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for part in columns:
+                samples, channels, _ = part.shape
+                beside = others[first : first + samples * channels].reshape(samples, channels, -1)
+                first += samples * channels
+                # time is last in memory
+                for i, channel in enumerate(self.noise.whiten(part).transpose(1, 2, 0)):
+                    across += channel @ beside[:, i]
+                    before += np.einsum("mt,mt->m", channel, channel)
+            return across[:, -1], before - (across[:, :-1] ** 2).sum(axis=1), before
 
     def gain(
         self, cleared: Array, before: Array, bounds: Array | None = None
@@ -219,13 +246,11 @@ def _score_changes(directions: ProjectedScores, hypotheses: Sequence[Hypothesis]
         after = run.time[:-1, None] >= moments
         driven = linear.driven * ship.theta[index]
         both = (driven[:, :, :, None] * after[:, None, None, :]).reshape(*driven.shape[:2], -1)
-        slope = sensitivities(replace(linear, driven=both))
+        slope = propagate(linear.a, both, np.zeros(both.shape[1:]))
         columns.append(run.seen(ship, slope)[:, :, : both.shape[2]])
-    cleared, before = directions.clear(columns)
+    along, squares, before = directions.alone(columns)
     # a run at the edge of stability has derivatives beyond numbers' range, which tell nothing
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        squares = (cleared**2).sum(axis=0)
-        along = cleared.T @ directions.nu
         factor = along / squares
         gain = along * factor
         told = (squares > _OWN * before) & np.isfinite(gain)

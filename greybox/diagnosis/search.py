@@ -29,7 +29,6 @@ from greybox.diagnosis.refitting import (
     likelier,
     on_all_processors,
     promises,
-    refit,
     refits,
     shortlist,
 )
@@ -419,29 +418,46 @@ def _needed(case: DiagnosisProblem, fit: Fit, without: Fit) -> bool:
 def weighed(case: DiagnosisProblem, found: Search) -> Search:
     """Return the search without causes that do not stand beside a generic force.
 
-    The least of them goes first: what it imitated may be another's once it is gone. Terms
-    without which held-out runs are worse than those of all stay in the model, and lose their name.
+    The least of them goes first: what it imitated may be another's once it is gone. Those that
+    stood are asked again once none of the others falls. Terms without which held-out runs are
+    worse than those of all stay in the model, and lose their name.
     """
     fit, leaning = found.final, []
-    stood = _stood(case, fit, found.causes, found.tried)
-    while fallen := [(cause, without) for cause, without in stood if not _stands(cause)]:
+    waiting = list(found.causes)
+    stood: list[tuple[Candidate, Fit]] = []
+    while True:
+        fallen = [(cause, without) for cause, without in stood if not _stands(cause)]
+        if not fallen:
+            if not waiting:
+                break
+            stood += _stood(case, fit, waiting, found.tried)
+            waiting = []
+            continue
         least, without = min(fallen, key=lambda item: _beyond(item[0]))
         leaning.append(least)
         stood = [item for item in stood if item[0] is not least]
         if _needed(case, found.final, without):
             continue
-        kept = [cause for cause, _ in stood]
         if without.escaped:
             # what does not stand holds the run within bounds: nothing of it can be told
+            kept = _as_found(found, [*waiting, *(cause for cause, _ in stood)])
             return replace(found, final=found.base, causes=(), leaning=(*leaning, *kept))
         fit = case.problem(fit.integrator).settle(without, SETTLE)
-        stood = _stood(case, fit, kept, found.tried)
+        waiting += [cause for cause, _ in stood if _stands(cause)]
+        others = [cause for cause, _ in stood if not _stands(cause)]
+        stood = _stood(case, fit, others, found.tried)
     return replace(
         found,
         final=fit,
-        causes=tuple(cause for cause, _ in stood),
+        causes=tuple(_as_found(found, [cause for cause, _ in stood])),
         leaning=tuple(leaning),
     )
+
+
+def _as_found(found: Search, causes: Sequence[Candidate]) -> list[Candidate]:
+    """Return causes in the order in which they were found."""
+    order = [c.hypothesis.key for c in found.causes]
+    return sorted(causes, key=lambda c: order.index(c.hypothesis.key))
 
 
 def _stood(
@@ -531,12 +547,15 @@ def instead(
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     rest = problem.drop(fit.point, best.hypothesis)
     without = problem.settle(problem.fit(rest, fit.noise, most=FIRST), 1)
-    out = []
+    asked = []
     for other in others[:_INSTEAD]:
         k = [a.key for a in other.fit.point.hypotheses].index(other.hypothesis.key)
         value = other.fit.point.values[k]
-        found = refit(problem, without, Score(other.hypothesis, value, other.gain))
-        proof = held_out.prove(without, found)
-        out.append(assess_candidate(proof, without, found, other.hypothesis, 1))
+        asked.append((without, Score(other.hypothesis, value, other.gain)))
+    held_out.contributions(without)
+    fits = refits(problem, asked, lambda found: held_out.prove(without, found))
+    out = [
+        assess_candidate(proof, without, found, hypothesis, 1) for hypothesis, found, proof in fits
+    ]
     proof = held_out.prove(without, fit)
     return without, assess_candidate(proof, without, fit, best.hypothesis, 1), out

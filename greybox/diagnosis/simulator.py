@@ -20,6 +20,8 @@ _ESCAPED = 1e3
 
 # lengths of log and sets of terms that a simulator keeps at hand
 _KEPT = 16
+# runs of a diagnosis that each of them counts for when it is asked whether machine code pays
+_RUNS = 30
 Active = tuple[int, ...]
 
 
@@ -89,9 +91,13 @@ class VaryingSimulator:
         ndarray
             (N, nx); infinite where the run escaped.
         """
-        changing = theta.ndim == 2
-        used = _used(theta)
-        kernel, split = self._kernel(tuple(used.tolist()), changing), drivers.shape[1]
+        changing, split = theta.ndim == 2, drivers.shape[1]
+        # as machine code one kernel does for all sets of terms, sooner than one is made for each
+        used = np.arange(theta.shape[-1])
+        kernel = self._kernel(tuple(used.tolist()), changing)
+        if not kernel.compiled(_RUNS):
+            used = _used(theta)
+            kernel = self._kernel(tuple(used.tolist()), changing)
         kernel.read[:, :split] = drivers[:-1]
         if changing:
             kernel.read[:, split:] = theta[:-1, used]

@@ -18,6 +18,7 @@ from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExec
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from functools import cache
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -183,6 +184,54 @@ def map_forked(
     if count < 2:
         return [function(piece) for piece in pieces]
     return list(_by_copies(function, pieces, count))
+
+
+@contextmanager
+def ahead(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
+    """Let a copy of this process compute what may be needed later, while this one goes on.
+
+    Where a process cannot be copied, or a cluster computes, it is computed once it is asked for.
+
+    Parameters
+    ----------
+    function : callable
+        Its result must be picklable.
+
+    Yields
+    ------
+    callable
+        Waits for the result and returns it, each time the same. What was not asked for ends with
+        the block.
+    """
+    if _cluster() is not None or lanes() < 2:
+        yield cache(function)
+        return
+    context = multiprocessing.get_context("fork")
+    received, sent = context.Pipe(duplex=False)
+
+    def work(first: int) -> None:
+        _begin_worker(first)
+        with suppress(Exception):
+            sent.send(function())
+
+    copy = context.Process(target=work, args=(os.getpid(),), daemon=True)
+    copy.start()
+    sent.close()
+
+    def result() -> Result:
+        try:
+            found: Result = received.recv()
+        except EOFError:
+            # what went wrong there goes wrong here, too, and is told
+            return function()
+        return found
+
+    try:
+        yield cache(result)
+    finally:
+        copy.terminate()
+        copy.join()
+        received.close()
 
 
 def _by_copies(

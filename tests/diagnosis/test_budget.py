@@ -39,6 +39,11 @@ def two_series(pair: Pair) -> tuple[np.ndarray, np.ndarray]:
     return one, other
 
 
+def states_of(pair: Pair) -> np.ndarray:
+    """The held-out errors of the states."""
+    return pair.held_fit.errors[0][:, :3]
+
+
 def off(pair: Pair, *series: np.ndarray, relative: float = 0.0) -> SwitchedOff:
     """A cause without which these series are left."""
     (errors,) = beside(pair, *series).held_fit.errors
@@ -49,7 +54,7 @@ def test_a_cause_takes_what_switching_it_off_does(pair: Pair) -> None:
     one, other = two_series(pair)
     base = beside(pair, one, other)
     causes = [off(pair, other), replace(off(pair, one), id="wind")]
-    budget = {p.part: p for p in error_budget([base], [pair], causes, None, None, 0)}
+    budget = {p.part: p for p in error_budget(states_of(base), [pair], causes, None, None, 0)}
     e0 = base.held_fit.errors[0]
     for i, state in enumerate("uvr"):
         whole = (e0[:, i] ** 2).sum()
@@ -68,7 +73,9 @@ def test_a_cause_takes_what_switching_it_off_does(pair: Pair) -> None:
 def test_a_cause_without_which_no_run_is_bounded_is_not_split(pair: Pair) -> None:
     one, _ = two_series(pair)
     lost = SwitchedOff("current", np.zeros((0, 3)), 0.1)
-    budget = {p.part: p for p in error_budget([beside(pair, one)], [pair], [lost], None, None, 0)}
+    budget = {
+        p.part: p for p in error_budget(states_of(beside(pair, one)), [pair], [lost], None, None, 0)
+    }
     assert "current" not in budget
     assert budget[REST].share["r"] > 0.8
 
@@ -76,7 +83,7 @@ def test_a_cause_without_which_no_run_is_bounded_is_not_split(pair: Pair) -> Non
 def test_terms_without_a_name_belong_to_motion_and_commands(pair: Pair) -> None:
     one, other = two_series(pair)
     base = beside(pair, one, other)
-    parts = error_budget([base], [pair], [], off(pair, other).errors, None, 0)
+    parts = error_budget(states_of(base), [pair], [], off(pair, other).errors, None, 0)
     found = next(p for p in parts if p.part == MOTION)
     e0, without = (p.held_fit.errors[0] for p in (base, beside(pair, other)))
     took = 1 - (without**2).sum(axis=0) / (e0**2).sum(axis=0)
@@ -92,8 +99,8 @@ def test_what_terms_do_beside_causes_only_cannot_be_split(pair: Pair) -> None:
     base = beside(pair, one)
     # without them the model that has no causes would err more
     worse = off(pair, one, 5 * other).errors
-    budget = {p.part: p for p in error_budget([base], [pair], [], worse, None, 0)}
-    plain = {p.part: p for p in error_budget([base], [pair], [], None, None, 0)}
+    budget = {p.part: p for p in error_budget(states_of(base), [pair], [], worse, None, 0)}
+    plain = {p.part: p for p in error_budget(states_of(base), [pair], [], None, None, 0)}
     for state in "uvr":
         assert budget[MOTION].share[state] == pytest.approx(plain[MOTION].share[state])
         assert budget[REST].share[state] == pytest.approx(plain[REST].share[state])
@@ -102,7 +109,7 @@ def test_what_terms_do_beside_causes_only_cannot_be_split(pair: Pair) -> None:
 def test_the_noise_of_the_sensors_has_its_own_share(pair: Pair) -> None:
     one, _ = two_series(pair)
     base = beside(pair, one)
-    budget = {p.part: p for p in error_budget([base], [pair], [off(pair)], None, None, 0)}
+    budget = {p.part: p for p in error_budget(states_of(base), [pair], [off(pair)], None, None, 0)}
     e0 = base.held_fit.errors[0]
     true = 2e-4 * len(e0) / (e0[:, 2] ** 2).sum()
     assert budget[SENSOR].share["r"] == pytest.approx(true, rel=0.15)
@@ -116,7 +123,7 @@ def test_an_uncertain_cause_has_a_wider_interval(pair: Pair) -> None:
 
     def width(relative: float) -> float:
         cause = off(pair, relative=relative)
-        parts = error_budget([base], [pair], [cause], None, None, 0)
+        parts = error_budget(states_of(base), [pair], [cause], None, None, 0)
         low, high = next(p for p in parts if p.part == "current").ci["u"]
         return high - low
 
@@ -125,7 +132,8 @@ def test_an_uncertain_cause_has_a_wider_interval(pair: Pair) -> None:
 
 def test_a_run_that_leaves_every_bound_has_no_budget(pair: Pair) -> None:
     escaped = replace(pair, held_fit=replace(pair.held_fit, cost=np.inf))
-    assert error_budget([escaped], [pair], [], None, None, 0) == ()
+    assert error_budget(states_of(pair), [escaped], [], None, None, 0) == ()
+    assert error_budget(np.zeros((0, 0)), [pair], [], None, None, 0) == ()
 
 
 def test_nothing_changes_where_nothing_is_switched_off(pair: Pair) -> None:

@@ -129,7 +129,7 @@ def test_prior_of_forces_that_keep_and_that_break_the_symmetry() -> None:
     # the second and third are images of each other, the last has none
     pushing = (("u", frozenset({"u"})),) * 4
     pushers = _Pushers(
-        np.ones(1), pushing, np.array([1.0, -1.0, -1.0, 0.0]), np.array([0, 2, 1, 3])
+        np.ones(1), ((0, 0),) * 4, pushing, np.array([1.0, -1.0, -1.0, 0.0]), np.array([0, 2, 1, 3])
     )
     every = pushers.used(ANYTHING)
     reflection = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, -1, 0, 0], [0, 0, 0, 0]])

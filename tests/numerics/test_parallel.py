@@ -28,7 +28,7 @@ from greybox.vessel.toml import example_vessel
 FORKED = """
 import os
 from greybox.errors import ExcitationError
-from greybox.numerics.parallel import lanes, map_forked, map_pieces
+from greybox.numerics.parallel import ahead, lanes, map_forked, map_pieces
 
 seen = []
 def piece(k):
@@ -53,6 +53,15 @@ except ExcitationError as error:
     assert str(error) == "piece 0 has no model."
 else:
     raise AssertionError("nothing was raised")
+
+with ahead(lambda: [os.getpid()]) as one, ahead(lambda: fails(7)) as other:
+    assert (one()[0] != os.getpid()) == apart and one() is one()
+    try:
+        other()
+    except ExcitationError as error:
+        assert str(error) == "piece 7 has no model."
+    else:
+        raise AssertionError("nothing was raised")
 """
 # the first worker that meets piece 3 dies at it
 DYING = """

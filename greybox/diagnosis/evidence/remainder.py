@@ -20,13 +20,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.evidence.features import HEADING, PAST, TIME, features, knots_of, parity
+from greybox.diagnosis.evidence.features import (
+    HEADING,
+    PAST,
+    TIME,
+    Features,
+    features,
+    knots_of,
+    parity,
+)
 from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.linear import NOWHERE, sensitivities
+from greybox.diagnosis.linear import NOWHERE
 from greybox.diagnosis.point import Fit
 from greybox.numerics.lagged_moments import correlation_factor
 from greybox.numerics.linalg import tall_svd
+from greybox.numerics.recursion import propagate
 
 Array = NDArray[np.float64]
 # of a state and the signals that a feature is a function of: whether it takes part
@@ -134,23 +143,31 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
         return any(use.takes(state, arguments) for use in uses)
 
     knots = knots_of(problem)
-    pushed, pushers = _pushed(problem, fit, knots, any_of, None)
-    raw = _stacked([fit.noise.whiten(c) for c in pushed])
-    with np.errstate(over="ignore"):
-        size = np.sqrt((raw**2).sum(axis=0))
-    if not np.isfinite(size).all():
+    nx, made = len(problem.structure.states), _features(problem, fit, knots)
+    pushers = _Pushers.of(made, problem.structure.states, any_of)
+    nu = np.concatenate([n.ravel() for n in fit.nu])
+    nu -= left @ (left.T @ nu)
+    pushed = _pushed(problem, fit, [pushers.alone(m, nx) for m in made])
+    whitened = [fit.noise.whiten(columns) for columns in pushed]
+    square, across = _products(whitened, np.column_stack([left, nu]))
+    if not np.isfinite(square).all():
         return [none for _ in uses]
+    size = np.sqrt(np.diag(square))
     size[size == 0] = 1.0
     size = np.sqrt((size**2 + size[pushers.images] ** 2) / 2)
-    raw /= size
-    along = left.T @ raw
-    nu = np.concatenate([n.ravel() for n in fit.nu])
+    along, toward = (across[:, :-1] / size[:, None]).T, across[:, -1] / size
     # of errors with a memory fewer tell anything new
-    alike = np.sqrt(correlation_factor(np.concatenate(fit.nu)))
-    raw -= left @ along
-    raw /= alike
-    nu = (nu - left @ (left.T @ nu)) / alike
-    moved, _ = _pushed(held, held_fit, knots, any_of, pushers.scales)
+    alike = correlation_factor(np.concatenate(fit.nu))
+    square = (square / np.outer(size, size) - along.T @ along) / alike
+    toward = toward / alike
+    deltas = np.zeros((len(size), len(uses)))
+    for delta, use in zip(deltas.T, uses, strict=True):
+        mine = pushers.used(use)
+        delta[mine] = _likeliest(square[np.ix_(mine, mine)], toward[mine], pushers, use)
+    there = _features(held, held_fit, knots)
+    moved = _pushed(
+        held, held_fit, [pushers.together(m, nx, deltas / size[:, None]) for m in there]
+    )
     point = replace(fit.point, starts=held_fit.point.starts)
     noise = held_fit.noise
     with np.errstate(over="ignore", invalid="ignore"):
@@ -158,27 +175,24 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
         begun = held.slopes(held_fit.point)
         starts = _stacked([noise.whiten(s) for s in begun])
     out = []
-    for use in uses:
-        mine = pushers.used(use)
-        delta = np.zeros(raw.shape[1])
-        delta[mine] = _likeliest(raw[:, mine], nu, pushers, use)
+    for k, delta in enumerate(deltas.T):
         # what the coefficients give back, where they can imitate
         back = (-((right.T / values) @ (along @ delta)) / scale)[:free]
         with np.errstate(over="ignore", invalid="ignore"):
             parts = [
-                columns @ (delta / size) + slopes[:, :, :free] @ back
+                columns[:, :, k] + slopes[:, :, :free] @ back
                 for columns, slopes in zip(moved, shown, strict=True)
             ]
-            whitened = _stacked([noise.whiten(p[:, :, None]) for p in parts])[:, 0]
-        if not (np.isfinite(whitened).all() and np.isfinite(starts).all()):
+            predicted = _stacked([noise.whiten(p[:, :, None]) for p in parts])[:, 0]
+        if not (np.isfinite(predicted).all() and np.isfinite(starts).all()):
             out.append(none)
             continue
-        taken = np.linalg.lstsq(starts, whitened, rcond=_UNKNOWN)[0]
+        taken = np.linalg.lstsq(starts, predicted, rcond=_UNKNOWN)[0]
         errors = tuple(
             e - (part - slopes @ taken)
             for e, part, slopes in zip(held_fit.errors, parts, begun, strict=True)
         )
-        out.append(GenericForce(whitened - starts @ taken, seen, errors, back))
+        out.append(GenericForce(predicted - starts @ taken, seen, errors, back))
     return out
 
 
@@ -199,6 +213,8 @@ class _Pushers:
     ----------
     scales : ndarray
         (G,) sizes of the features.
+    columns : tuple of (int, int)
+        (m,) the equation's and the feature's index.
     pushing : tuple of (str, frozenset of str)
         (m,) the equation, and the signals that the feature is a function of.
     signs, images : ndarray
@@ -207,9 +223,52 @@ class _Pushers:
     """
 
     scales: Array
+    columns: tuple[tuple[int, int], ...]
     pushing: tuple[tuple[str, frozenset[str]], ...]
     signs: Array
     images: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, made: Sequence[Features], states: Sequence[str], takes: Takes) -> _Pushers:
+        """Return all features of logs in every equation that they push."""
+        scales = np.sqrt(np.mean(np.concatenate([m.values**2 for m in made]), axis=0))
+        arguments = made[0].arguments
+        columns = [
+            (i, k)
+            for i, state in enumerate(states)
+            for k, of in enumerate(arguments)
+            if takes(state, of)
+        ]
+        place = {column: at for at, column in enumerate(columns)}
+        images = [place.get((i, int(made[0].images[k])), -1) for i, k in columns]
+        signs = [
+            parity(states[i]) * made[0].signs[k] if image >= 0 else 0.0
+            for (i, k), image in zip(columns, images, strict=True)
+        ]
+        images = [at if image < 0 else image for at, image in enumerate(images)]
+        pushing = tuple((states[i], arguments[k]) for i, k in columns)
+        return cls(
+            np.where(scales > 0, scales, 1.0), tuple(columns), pushing, np.array(signs),
+            np.array(images, np.intp),
+        )  # fmt: skip
+
+    def alone(self, made: Features, equations: int) -> Array:
+        """Return how each column alone pushes the equations along a log, (N−1, nx, m)."""
+        unit = made.values[:-1] / self.scales
+        out = np.zeros((len(unit), equations, len(self.columns)))
+        for i in range(equations):
+            mine = [(at, k) for at, (of, k) in enumerate(self.columns) if of == i]
+            if mine:
+                # those of an equation stand side by side
+                out[:, i, mine[0][0] : mine[-1][0] + 1] = unit[:, [k for _, k in mine]]
+        return out
+
+    def together(self, made: Features, equations: int, shares: Array) -> Array:
+        """Return how shares (m, c) of the columns push the equations, (N−1, nx, c)."""
+        of_features = np.zeros((len(self.scales), equations, shares.shape[1]))
+        for (i, k), share in zip(self.columns, shares, strict=True):
+            of_features[k, i] = share / self.scales[k]
+        return np.tensordot(made.values[:-1], of_features, 1)
 
     def used(self, use: Use) -> NDArray[np.intp]:
         """Return the indices of those that take part."""
@@ -237,54 +296,70 @@ class _Pushers:
         return root
 
 
-def _pushed(
-    problem: Problem, fit: Fit, knots: Array, takes: Takes, scales: Array | None
-) -> tuple[list[Array], _Pushers]:
-    """Return ∂y of every feature in every equation that it pushes, and which they are."""
-    point = fit.point
-    ship = point.ship
-    made = [features(r, fit, s, knots) for r, s in zip(problem.runs, point.starts, strict=True)]
-    if scales is None:
-        scales = np.sqrt(np.mean(np.concatenate([m.values**2 for m in made]), axis=0))
-        scales = np.where(scales > 0, scales, 1.0)
-    states, arguments = problem.structure.states, made[0].arguments
-    wanted = [[k for k, of in enumerate(arguments) if takes(state, of)] for state in states]
-    out = []
-    for run, start, g in zip(problem.runs, point.starts, made, strict=True):
+def _features(problem: Problem, fit: Fit, knots: Array) -> list[Features]:
+    runs = zip(problem.runs, fit.point.starts, strict=True)
+    return [features(run, fit, start, knots) for run, start in runs]
+
+
+def _pushed(problem: Problem, fit: Fit, drives: Sequence[Array]) -> list[Array]:
+    """Return ∂y (N, ny, m) of each log by what pushes its equations, (N−1, nx, m)."""
+    ship, out = fit.point.ship, []
+    for run, start, driven in zip(problem.runs, fit.point.starts, drives, strict=True):
         shown = run.run(ship, start)
         linear = run.linearise(ship, shown, NOWHERE)
-        unit = g.values[:-1] / scales
-        driven = np.zeros((len(unit), shown.x.shape[1], sum(map(len, wanted))))
-        first = 0
-        for i, mine in enumerate(wanted):
-            driven[:, i, first : first + len(mine)] = unit[:, mine]
-            first += len(mine)
-        slope = sensitivities(replace(linear, driven=driven))
+        slope = propagate(linear.a, driven, np.zeros(driven.shape[1:]))
         out.append(run.seen(ship, slope)[:, :, : driven.shape[2]])
-    columns = [(i, k) for i, mine in enumerate(wanted) for k in mine]
-    place = {column: at for at, column in enumerate(columns)}
-    images = [place.get((i, int(made[0].images[k])), -1) for i, k in columns]
-    signs = [
-        parity(states[i]) * made[0].signs[k] if image >= 0 else 0.0
-        for (i, k), image in zip(columns, images, strict=True)
-    ]
-    images = [at if image < 0 else image for at, image in enumerate(images)]
-    pushing = tuple((states[i], arguments[k]) for i, k in columns)
-    return out, _Pushers(scales, pushing, np.array(signs), np.array(images, np.intp))
+    return out
+
+
+def _products(parts: Sequence[Array], others: Array) -> tuple[Array, Array]:
+    """Return products of columns (N, ny, m) of logs with each other, and with others.
+
+    Parameters
+    ----------
+    parts : sequence of ndarray
+    others : ndarray
+        (n, k), the rows of all logs one after another.
+
+    Returns
+    -------
+    tuple of ndarray
+        (m, m) and (m, k)
+    """
+    size = parts[0].shape[2]
+    square, across, first = np.zeros((size, size)), np.zeros((size, others.shape[1])), 0
+    with np.errstate(over="ignore", invalid="ignore"):
+        for part in parts:
+            samples, channels, _ = part.shape
+            beside = others[first : first + samples * channels].reshape(samples, channels, -1)
+            first += samples * channels
+            # time is last in memory
+            for i, channel in enumerate(part.transpose(1, 2, 0)):
+                square += channel @ channel.T
+                across += channel @ beside[:, i]
+    return square, across
 
 
 def _stacked(parts: Sequence[Array]) -> Array:
     return np.concatenate([p.reshape(-1, p.shape[2]) for p in parts])
 
 
-def _likeliest(rows: Array, nu: Array, pushers: _Pushers, use: Use) -> Array:
-    """Return coefficients (k,) by the strengths that make the innovations likeliest."""
+def _likeliest(square: Array, along: Array, pushers: _Pushers, use: Use) -> Array:
+    """Return coefficients (k,) by the strengths that make the innovations likeliest.
+
+    Parameters
+    ----------
+    square, along : ndarray
+        (k, k), (k,) products of the rows, and of the rows with the innovations.
+    pushers : _Pushers
+    use : Use
+        Which of them the rows are of.
+    """
     ways = [(float(use.parity > 0), float(use.parity < 0))]
     if not use.parity:
         ways = [(1.0, broken) for broken in _BROKEN]
     mine = pushers.used(use)
     tried = [pushers.deviations(mine, *way) for way in ways]
-    square, along = rows.T @ rows, rows.T @ nu
     found = [(_ridge(root.T @ square @ root, root.T @ along), root) for root in tried]
     (_, best), root = min(found, key=lambda f: f[0][0])
     return np.asarray(root @ best)

@@ -219,6 +219,10 @@ class FreeRunKernel:
     def _states(self) -> Array:
         return np.empty((len(self._read), len(self.start)))
 
+    def compiled(self, runs: int) -> bool:
+        """Return whether so many runs are to be taken by machine code, and count them."""
+        return self._loop.pays(runs * len(self.read))
+
     def __call__(self, out: Array | None = None) -> Array:
         """Run, and return the states after each step (N, nx).
 
