@@ -155,7 +155,7 @@ class Asymmetry(Cause):
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say in which equations."""
-        return f"{equations(values)} differ between port and starboard ({listed(values)})"
+        return f"forces on {equations(values)} differ from port to starboard ({listed(values)})"
 
 
 class SideForce(Cause):
@@ -175,4 +175,4 @@ class SideForce(Cause):
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say their sizes."""
-        return f"{equations(values)} is pushed to one side at every heading ({listed(values)})"
+        return f"a constant force acts on {equations(values)} at every heading ({listed(values)})"
