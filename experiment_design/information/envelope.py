@@ -34,7 +34,7 @@ from greybox.numerics.vectorised import Vectorised
 
 Array = NDArray[np.float64]
 
-# constant commands that are tried, and for how many time scales each is held
+# constant commands that are tried, and after how many time scales the motion is steady
 _TRIED, _SETTLING = 1000, 60.0
 # sequences that stand for the envelope, their length, and after how long a free run begins anew
 _SEQUENCES, _LENGTH, _RUN = 40, 40.0, 20.0
@@ -46,13 +46,11 @@ _CENTRES = 40
 _SAMPLES = 160
 # share of the settings that count as straight, and how often one of these is held
 _STRAIGHT, _COURSE = 0.1, 0.25
-# speed at the start, as a share of the fastest straight motion
-_APPROACH = 1.0
-# slowest and fastest steady motion that counts, in what the prior's trial showed
+# slowest and fastest surge of the envelope, in what the prior's trial showed
 _SLOWEST, _FASTEST = 0.55, 1.1
 # what not even the potential terms say, as a share of the spread of each state
 _UNSAID = 0.05
-# share of the commands under which the prior must hold the ship
+# share of the commands, and of the usual manoeuvres, under which the prior must hold the ship
 HELD = 0.25
 # least misfit, as a share of the spread of each state
 _LEAST_MISFIT = 0.05
@@ -72,10 +70,14 @@ class Envelope:
         (nx,) of the output error at a sample, counted as if each were new.
     lower, upper : ndarray
         (nc,) range of each command.
+    speeds : tuple of float
+        Slowest and fastest surge [m/s].
     settings : ndarray
-        (S, nc) constant commands within it that hold the ship in the envelope.
-    steady : ndarray
-        (S, nx) the motions that they settle to [m/s, rad/s].
+        (S, nc) constant commands that keep the ship within both, from a course at speed.
+    lasting : ndarray
+        (S,) for how long they do [s], at most the longest hold.
+    reached : ndarray
+        (S, nx) the motions that the ship then has [m/s, rad/s].
     straight : ndarray of int
         (m,) those of them that hold a course best.
     time_scale : float
@@ -91,8 +93,10 @@ class Envelope:
     variance: Array
     lower: Array
     upper: Array
+    speeds: tuple[float, float]
     settings: Array
-    steady: Array
+    lasting: Array
+    reached: Array
     straight: NDArray[np.intp]
     time_scale: float
     misfit: Array
@@ -198,24 +202,36 @@ class Envelope:
         ]
         return every * np.array([part.transpose(0, 2, 1) @ part for part in told])
 
-    def pick(self, rng: np.random.Generator) -> Array:
-        """Draw one setting (nc,): any, or now and then one that holds a course."""
-        return _picked(self.settings, self.straight, rng)
+    def within(self, motion: Motion) -> NDArray[np.bool_]:
+        """Return at which samples of R motions surge is within that of the envelope, (R, N+1)."""
+        return _within(motion, self.speeds)
+
+    def pick(self, rng: np.random.Generator) -> tuple[Array, float]:
+        """Draw one setting (nc,), any or now and then a course, and how long it may last [s]."""
+        which = _picked(self.settings, self.straight, rng)
+        return self.settings[which], float(self.lasting[which])
 
     def draw(self, samples: int, rng: np.random.Generator) -> Array:
         """Draw commands (N, nc) as the ship is used: settings that are held short and long."""
-        scale = self.time_scale / self.rollout.sample_time
-        return _drawn(self.settings, self.straight, samples, scale, rng)
+        dt = self.rollout.sample_time
+        return _drawn(self.settings, self.lasting / dt, self.straight, samples,
+                      self.time_scale / dt, rng)  # fmt: skip
 
 
-def _picked(settings: Array, straight: NDArray[np.intp], rng: np.random.Generator) -> Array:
+def _within(motion: Motion, speeds: tuple[float, float]) -> NDArray[np.bool_]:
+    surge = motion.state[..., 0]
+    return np.asarray((surge >= speeds[0]) & (surge <= speeds[1]) & motion.stable[:, None])
+
+
+def _picked(settings: Array, straight: NDArray[np.intp], rng: np.random.Generator) -> int:
     if rng.random() < _COURSE:
-        return np.asarray(settings[straight[rng.integers(len(straight))]])
-    return np.asarray(settings[rng.integers(len(settings))])
+        return int(straight[rng.integers(len(straight))])
+    return int(rng.integers(len(settings)))
 
 
 def _drawn(
     settings: Array,
+    lasting: Array,
     straight: NDArray[np.intp],
     samples: int,
     scale: float,
@@ -224,9 +240,10 @@ def _drawn(
     out = np.empty((samples, settings.shape[1]))
     first = 0
     while first < samples:
-        held = max(1, round(scale * float(np.exp(rng.uniform(*np.log(HOLDS))))))
-        out[first : first + held] = _picked(settings, straight, rng)
-        first += held
+        which = _picked(settings, straight, rng)
+        held = min(scale * float(np.exp(rng.uniform(*np.log(HOLDS)))), lasting[which])
+        last = first + max(1, round(held))
+        out[first:last], first = settings[which], last
     return out
 
 
@@ -317,52 +334,58 @@ def build_envelope(
     ).T
     dt, nx, length = rollout.sample_time, rollout.nx, rollout.vessel.length
     tried = lower + (upper - lower) * rng.random((_TRIED, len(lower)))
+    shown = (-np.inf, np.inf)
     fast = 1.0 if speeds is None else max(abs(speeds[0]), abs(speeds[1]))
+    if speeds is not None and speeds[0] > 0:
+        shown = (_SLOWEST * speeds[0], _FASTEST * speeds[1])
     scale = max((length or 20 * fast) / fast, 4 * dt)
     settled = rollout.run(np.repeat(tried[:, None], int(_SETTLING * scale / dt), axis=1))
     steady = settled.state[:, -1, :nx]
-    held = settled.stable
-    if speeds is not None and speeds[0] > 0:
-        held &= (steady[:, 0] >= _SLOWEST * speeds[0]) & (steady[:, 0] <= _FASTEST * speeds[1])
-    elif speeds is None:
-        fast = float(np.quantile(steady[held, 0], 0.98)) if held.any() else 1.0
-        held &= steady[:, 0] >= 0.2 * fast
+    if speeds is None:
+        fast = float(np.quantile(steady[settled.stable, 0], 0.98)) if settled.stable.any() else 1.0
+        shown = (0.2 * fast, np.inf)
         scale = max((length or 20 * fast) / fast, 4 * dt)
+    held = _within(settled, shown)[:, -1]
+    if held.any():
+        # where a crew would begin: on a course, at speed
+        course = _straight(steady[held])
+        begun = course[int(steady[held][course, 0].argmax())]
+        rollout = Rollout(
+            rollout.vessel, rollout.structure, rollout.theta, rollout.d,
+            np.append(steady[held][begun], 0.0), dt, rollout.integrator,
+        )  # fmt: skip
+        motion = rollout.run(np.repeat(tried[:, None], int(HOLDS[1] * scale / dt), axis=1))
+        # until when a setting keeps the ship within the envelope, at most the longest hold
+        kept = np.logical_and.accumulate(_within(motion, shown), axis=1).sum(axis=1) - 1
+        held = kept >= HOLDS[0] * scale / dt
     if held.mean() < HELD:
         raise InfeasibleError(
             f"the prior model holds the ship within the speeds of its own trial under "
             f"{100 * held.mean():.0f} % of the commands, {100 * HELD:.0f} % are needed to plan "
             f"with it: estimate it on a longer trial, or use --prior none."
         )
-    settings, steady = tried[held], steady[held]
-    aside = (np.abs(steady[:, 1:]) / np.maximum(steady[:, 1:].std(axis=0), 1e-12)).sum(axis=1)
-    straight = np.argsort(aside, kind="stable")[: max(1, round(_STRAIGHT * len(steady)))]
-    # where a crew would begin: on a course, at speed
-    ahead = steady[straight, 0]
-    begun = straight[int(np.abs(ahead - _APPROACH * ahead.max()).argmin())]
-    start = np.append(steady[begun], 0.0)
-    rollout = Rollout(
-        rollout.vessel, rollout.structure, rollout.theta, rollout.d, start, dt, rollout.integrator
-    )
+    settings, kept = tried[held], kept[held]
+    reached = motion.state[held, kept, :nx]
+    straight = _straight(reached)
     samples = int(_LENGTH * scale / dt)
     used = np.array(
-        [_drawn(settings, straight, samples, scale / dt, rng) for _ in range(_SEQUENCES)]
+        [_drawn(settings, kept, straight, samples, scale / dt, rng) for _ in range(_SEQUENCES)]
     )
     motion = rollout.run(used)
-    good = motion.stable
-    if good.mean() < HELD:
+    inside = _within(motion, shown)[:, :-1]
+    if inside.mean() < HELD:
         raise InfeasibleError(
-            f"the prior model runs away in {100 * (1 - good.mean()):.0f} % of the usual "
-            f"manoeuvres: estimate it on a longer trial, or use --prior none."
+            f"the prior model leaves the speeds of its own trial for "
+            f"{100 * (1 - inside.mean()):.0f} % of the usual manoeuvres: estimate it on a longer "
+            f"trial, or use --prior none."
         )
-    motion = Motion(motion.state[good], motion.tau[good], motion.commands[good], good[good])
-    x = motion.state[:, :-1, :nx]
-    signals = np.concatenate([x, motion.commands], axis=-1)
-    features = _Features(rollout, predictor, signals.reshape(-1, signals.shape[-1])[::7], seed)
-    rows, _ = _sensitivities(rollout, predictor, features, motion, int(_RUN * scale / dt))
-    spread = x.reshape(-1, nx).std(axis=0)
+    x = motion.state[:, :-1, :nx][inside]
+    signals = np.concatenate([x, motion.commands[inside]], axis=-1)
+    features = _Features(rollout, predictor, signals[::7], seed)
+    rows, every = _sensitivities(rollout, predictor, features, motion, int(_RUN * scale / dt))
+    spread = x.std(axis=0)
     spread[spread == 0] = 1.0
-    s = np.stack(list(rows)).reshape(-1, nx, len(predictor.columns) + nx * features.size)
+    s = np.stack(list(rows), axis=1)[inside[:, ::every]]
     moments = tuple(s[:, i].T @ s[:, i] / (len(s) * spread[i] ** 2) for i in range(nx))
     share = np.maximum(misfit, _LEAST_MISFIT)
     tau = _prior_variance(moments, len(predictor.columns), share)
@@ -372,9 +395,15 @@ def build_envelope(
     variance = np.asarray(noise.measurement, float) ** 2 + lasting * by_step
     precision = np.concatenate([np.zeros(len(predictor.columns)), 1 / tau])
     return Envelope(
-        rollout, predictor, variance, lower, upper, settings, steady, straight, scale, share,
-        spread, features, moments, precision,
+        rollout, predictor, variance, lower, upper, shown, settings, kept * dt, reached, straight,
+        scale, share, spread, features, moments, precision,
     )  # fmt: skip
+
+
+def _straight(reached: Array) -> NDArray[np.intp]:
+    """Return which of some motions (S, nx) hold a course best."""
+    aside = np.abs(reached[:, 1:]) / np.maximum(reached[:, 1:].std(axis=0), 1e-12)
+    return np.argsort(aside.sum(axis=1), kind="stable")[: max(1, round(_STRAIGHT * len(reached)))]
 
 
 def _sensitivities(

@@ -74,10 +74,10 @@ def usual_manoeuvres(envelope: Envelope, holds: int, hold: float) -> Array:
     hold : float
         [s]
     """
-    settings, steady = envelope.settings, envelope.steady
+    settings, reached = envelope.settings, envelope.reached
     right, left = _to_both_sides(envelope, _TURN, fast=True)
     slow_right, slow_left = _to_both_sides(envelope, _TURN, fast=False)
-    course = settings[envelope.straight[int(steady[envelope.straight, 0].argmax())]]
+    course = settings[envelope.straight[int(reached[envelope.straight, 0].argmax())]]
     order = np.array([
         course, right, left, right, left, slow_left, slow_right, slow_left, slow_right, left,
     ])  # fmt: skip
@@ -120,10 +120,10 @@ def _leg(envelope: Envelope, hold: float) -> int:
 
 def _to_both_sides(envelope: Envelope, share: float, *, fast: bool) -> tuple[Array, Array]:
     """Return the settings (nc,) that turn to starboard and port by a share of the largest rate."""
-    settings, steady = envelope.settings, envelope.steady
-    rate = steady[:, -1] if steady.shape[1] > 1 else np.zeros(len(steady))
-    middle = np.median(steady[:, 0])
-    part = steady[:, 0] >= middle if fast else steady[:, 0] < middle
+    settings, reached = envelope.settings, envelope.reached
+    rate = reached[:, -1] if reached.shape[1] > 1 else np.zeros(len(reached))
+    middle = np.median(reached[:, 0])
+    part = reached[:, 0] >= middle if fast else reached[:, 0] < middle
     # straight motion passes for both sides of a ship that cannot turn
     wanted = share * np.abs(rate[part]).max(initial=0.0)
     right, left = (settings[part][int(np.abs(rate[part] - s * wanted).argmin())] for s in (1, -1))
@@ -210,7 +210,7 @@ def exchange_settings(
             motion = problem.scenarios[0].rollout.run(problem.schedule.expand(complete))
             value = worth(motion)
             missed = problem.scenarios[0].limits.violations(motion)
-            aside = one_sided(envelope, motion)
+            aside = one_sided(envelope, motion) + 1 - envelope.within(motion).mean(axis=1)
             out += [
                 (p, Candidate(u, float(v), np.append(missed[:, i], aside[i])))
                 for i, (p, u, v) in enumerate(
@@ -219,13 +219,17 @@ def exchange_settings(
             ]
         return out
 
+    def picked(rng: np.random.Generator) -> tuple[Array, int]:
+        setting, lasting = envelope.pick(rng)
+        return setting, _held(rng, max(1, min(longest, int(lasting / hold))))
+
     def drawn(count: int, rng: np.random.Generator) -> Array:
         out = np.empty((count, holds, len(problem.schedule.commands)))
         for levels in out:
             k = 0
             while k < holds:
-                held = _held(rng, longest)
-                levels[k : k + held] = envelope.pick(rng)
+                setting, held = picked(rng)
+                levels[k : k + held] = setting
                 k += held
         return out
 
@@ -234,10 +238,10 @@ def exchange_settings(
         if len(beginnings) > 1 and rng.random() < _BEGINS_ANEW:
             out[:begun] = beginnings[rng.integers(len(beginnings))]
         for _ in range(int(rng.integers(1, 4))):
-            held = _held(rng, longest)
+            setting, held = picked(rng)
             i = int(rng.integers(begun, holds - held + 1))
             if rng.random() < _ANEW:
-                out[i : i + held] = envelope.pick(rng)
+                out[i : i + held] = setting
             else:
                 j = int(rng.integers(begun, holds - held + 1))
                 out[i : i + held], out[j : j + held] = (
@@ -268,7 +272,7 @@ def exchange_settings(
 
     found = better(map_forked(chain, range(_CHAINS), workers=workers))
     values = np.array([c.value for _, c in random])
-    # the sides that a sequence goes to are no limit of the trial
+    # the sides and speeds that a sequence goes to are no limits of the trial
     best, reference = (replace(c, missed=c.missed[:-1]) for _, c in (found[0], better(random)[0]))
     return EnvelopeSearch(best, values, reference, RANDOM + _CHAINS * rounds * tries)
 
@@ -277,7 +281,7 @@ def one_sided(envelope: Envelope, motion: Motion) -> Array:
     """Return by how much the rarer sign of sway or yaw rate falls short of its share, (R,)."""
     short = np.zeros(len(motion.state))
     for i, name in enumerate(envelope.rollout.structure.states):
-        to_starboard = (envelope.steady[:, i] > 0).mean()
+        to_starboard = (envelope.reached[:, i] > 0).mean()
         if name not in ("v", "r") or min(to_starboard, 1 - to_starboard) < _EITHER / 2:
             continue
         share = (motion.state[:, :, i] > 0).mean(axis=1)

@@ -179,7 +179,8 @@ def select_terms(
     with within(_FOR_PRESENT * seconds_left()):
         Refit.ahead([refit], [fitting for fitting, _ in parts])
         present_score = [_present_score(refit, *part, spread) for part in parts]
-    turns = -(-len(laws) // lanes()) * (len(laws) > 1)
+    few_tasks = [(of, b) for of in laws for b in range(len(beginnings)) if len(laws) > 1]
+    turns = -(-len(few_tasks) // lanes())
     watch = _Watch(turns + -(-len(beginnings) * (1 + len(parts)) // lanes()))
 
     def path_of(task: tuple[Sequence[TrialLog], str, int]) -> list[Selected]:
@@ -189,8 +190,8 @@ def select_terms(
         chosen_on = selection
         if of is not logs:
             chosen_on = FreeRunSelection(of, family, kind)
-        elif begun == 0:
-            passed = of_laws[laws.index(law)]
+        else:
+            passed = few.get((law, begun), [])
         try:
             with watch.next(what):
                 return chosen_on.path(beginnings[begun], stay, most, passed=passed)
@@ -201,20 +202,22 @@ def select_terms(
             _log.info("no path from %d terms: %s", len(beginnings[begun]), error)
             return []
 
-    def few_terms(of: ThrustLaw) -> list[Selected]:
-        """Return the path to few terms with a thrust law, empty where time is over before."""
+    def few_terms(task: tuple[ThrustLaw, int]) -> list[Selected]:
+        """Return the path to few terms with a thrust law, empty where there is none in time."""
+        of, begun = task
         selection = FreeRunSelection(with_law(logs, of), family, kind)
         try:
             with watch.next(f"thrust ~ {law_in_words(of)}"):
-                return selection.path(beginnings[0], stay, min(FEW, most))
-        except OutOfTimeError:
+                return selection.path(beginnings[begun], stay, min(FEW, most))
+        except GreyboxError:
             return []
 
+    few = dict(zip(few_tasks, watch.over(few_terms, few_tasks), strict=True)) if few_tasks else {}
     law, errors = laws[0], [np.nan]
-    of_laws: list[list[Selected]] = [[]]
-    if len(laws) > 1:
-        of_laws = watch.over(few_terms, laws)
-        errors = [sets[-1].cost if sets else np.inf for sets in of_laws]
+    if few:
+        # a path may end where no term helps: the better beginning counts
+        ends = np.array([sets[-1].cost if sets else np.inf for sets in few.values()])
+        errors = ends.reshape(len(laws), -1).min(axis=1).tolist()
         best_law = int(np.argmin(errors))
         law = laws[-1] if errors[-1] < (1 + _NEAR) * errors[best_law] else laws[best_law]
     logs = with_law(logs, law)
@@ -253,14 +256,14 @@ def select_terms(
     assert best is not None
     shorter = [_of_size(path[begun], size_shown) for path in paths]
     named = {name for found in shorter if found for name in found.terms}
-    few = replace(family, terms=tuple(t for t in family.terms if t.name in named))
+    reduced = replace(family, terms=tuple(t for t in family.terms if t.name in named))
 
     def score_step(step: Step) -> Array:
         """Return the weighted scores of these terms, fitted again on each part's other logs."""
         score = []
         for found, part in zip(shorter, _judging_parts(logs), strict=True):
             fitting, held = (
-                FreeRunSelection(with_commands(of, step.commands), few, kind, step.integrator)
+                FreeRunSelection(with_commands(of, step.commands), reduced, kind, step.integrator)
                 for of in part
             )
             errors: list[Array] = []

@@ -17,7 +17,13 @@ from experiment_design.for_prediction import (
     prior_misfit,
 )
 from experiment_design.information.envelope import _sensitivities, build_envelope
-from experiment_design.optimise.envelope_search import one_sided, usual_beginnings, usual_manoeuvres
+from experiment_design.optimise.envelope_search import (
+    exchange_settings,
+    one_sided,
+    usual_beginnings,
+    usual_manoeuvres,
+)
+from experiment_design.request.request import build_problem
 from greybox.commands.main import main
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
@@ -32,7 +38,7 @@ def request_of(**changes):
     return make_request(**changes)
 
 
-def envelope_of(request, seed=0):
+def envelope_of(request, seed=0, speeds=None):
     predictor = build_predictor(request.structure, "basic", (("u", (1, -1)),))
     rollout = Rollout(
         request.vessel, request.structure, request.theta, request.d, request.starts[0],
@@ -40,7 +46,7 @@ def envelope_of(request, seed=0):
     )  # fmt: skip
     ranges = {n: (float(v.lower), float(v.upper)) for n, v in request.vessel.limits.items()}
     return build_envelope(
-        rollout, predictor, request.noise, request.schedule, ranges, None, np.full(3, 0.2), seed
+        rollout, predictor, request.noise, request.schedule, ranges, speeds, np.full(3, 0.2), seed
     )
 
 
@@ -143,14 +149,43 @@ def test_forces_that_mislead_move_free_runs_by_the_misfit(envelope) -> None:
 def test_a_trial_goes_to_both_sides(envelope) -> None:
     motion = motion_of(envelope)
     r = motion.state[..., 2]
-    both = replace(envelope, steady=np.vstack([envelope.steady, -envelope.steady]))
+    both = replace(envelope, reached=np.vstack([envelope.reached, -envelope.reached]))
     turned = replace(motion, state=np.abs(motion.state))
     assert one_sided(both, turned)[0] == pytest.approx(0.35)
     share = min((r > 0).mean(), (r < 0).mean())
     assert one_sided(both, motion)[0] >= 0.35 - share - 1e-12
     # a ship that turns to one side only is not asked to do otherwise
-    alone = replace(envelope, steady=np.abs(envelope.steady))
+    alone = replace(envelope, reached=np.abs(envelope.reached))
     assert one_sided(alone, turned)[0] == 0.0
+
+
+def test_a_setting_that_leaves_the_speeds_is_held_for_as_long_as_it_does_not() -> None:
+    request = request_of()
+    # many settings end below 0.55 of the slowest speed
+    found = envelope_of(request, speeds=(2.8, 2.7))
+    low, high = found.speeds
+    assert (low, high) == pytest.approx((0.55 * 2.8, 1.1 * 2.7))
+    dt, scale = request.sample_time, found.time_scale
+    kept = np.round(found.lasting / dt).astype(int)
+    # few are missing, and each is held half a length at least
+    assert len(found.settings) > 990
+    assert 0.5 * scale <= found.lasting.min() < found.lasting.max() <= 6 * scale
+    long = found.rollout.run(np.repeat(found.settings[:, None], int(60 * scale / dt), axis=1))
+    surge = long.state[..., 0]
+    short = found.lasting < found.lasting.max()
+    assert 0.05 < short.mean() <= (surge < low).any(axis=1).mean()
+    for i in np.flatnonzero(short):
+        assert (surge[i, : kept[i] + 1] >= low).all()
+        assert surge[i, kept[i] + 1] < low
+        assert long.state[i, kept[i], :3] == pytest.approx(found.reached[i])
+    # a plan that has such settings one after the other leaves the speeds and is not taken
+    problem = build_problem(replace(request, starts=(found.rollout.start,)))
+    best = exchange_settings(
+        problem, found, lambda m: found.error_without_parts(m, 0.0, 4) ** -1, 1, effort=0.1
+    ).candidate
+    plan = found.rollout.run(problem.schedule.expand(problem.levels(best.unit))[None])
+    assert found.within(plan).all()
+    assert not found.within(long).all()
 
 
 def test_more_samples_leave_less_and_a_run_that_escapes_nothing(envelope) -> None:
@@ -168,7 +203,7 @@ def test_usual_manoeuvres_go_to_both_sides_at_two_speeds(envelope) -> None:
     levels = usual_manoeuvres(envelope, 60, hold)
     assert levels.shape == (60, 3)
     states = np.array(
-        [envelope.steady[np.abs(envelope.settings - v).sum(axis=1).argmin()] for v in levels]
+        [envelope.reached[np.abs(envelope.settings - v).sum(axis=1).argmin()] for v in levels]
     )
     assert states[:, 2].max() > 0 > states[:, 2].min() or np.ptp(states[:, 2]) > 0
     assert np.ptp(states[:, 0]) > 0
@@ -179,7 +214,7 @@ def test_usual_beginnings_are_zigzags_and_turns_for_a_stated_share(envelope) -> 
     hold = envelope.time_scale
     found = usual_beginnings(envelope, 100, hold)
     assert found.shape[1:] == (15, 3)
-    rate = envelope.steady[
+    rate = envelope.reached[
         [[np.abs(envelope.settings - v).sum(axis=1).argmin() for v in e] for e in found], 2
     ]
     for zigzag, turn in zip(rate[::4], rate[2::4], strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,8 +15,9 @@ from greybox.estimation.output_error import OutputErrorOptions
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.model import load_model
 from greybox.model.run.simulation import simulate
+from greybox.selection import term_selection
 from greybox.selection.cross_validation import Refit, parts_of
-from greybox.selection.estimate import at_own_pace, estimate_model, nominal_model
+from greybox.selection.estimate import _leaves_more, at_own_pace, estimate_model, nominal_model
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection
 from greybox.selection.term_selection import select_terms
@@ -130,6 +132,19 @@ def test_damping_never_drives_the_ship(modulus_log):
                 assert one.p[selection.names.index(term.name)] <= 0
 
 
+def test_damping_that_nothing_excites_stops_no_path(modulus_log):
+    """What a log says nothing of took any step, and each run with it escaped."""
+    family = family_for(force_inputs(modulus_log.vessel), False, False)
+    selection = FreeRunSelection([modulus_log], family, "augmented")
+    first = ("Xu", "Xmu", "Yv", "Nr")
+    sets = selection.path(first, first, 8)
+    assert len(sets[-1].terms) == 8
+    assert sets[-1].cost < 0.2 * sets[0].cost
+    for one in sets:
+        # within a sample damping takes no more than there is
+        assert all(one.p[selection.names.index(n)] >= -1 for n in ("Xu", "Yv", "Nr"))
+
+
 def test_a_channel_that_never_moves_lets_its_terms_leave(modulus_log):
     log = replace(modulus_log, channels=modulus_log.channels | {"v": 0 * modulus_log["v"]})
     inputs = force_inputs(log.vessel)
@@ -156,6 +171,16 @@ def test_a_published_structure_stays_where_it_follows_within_noise():
     found = estimate_model([virtual_log(4, 600, wind=0.0, spread=1e-12, current=(0.0, 0.0))])
     assert found.predictor.structure.name.startswith(("thesis", "linear"))
     assert not any("selected" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(("error", "own", "leaves"), [(0.006, 0.0058, True), (0.006, 0.005, False),
+                                                     (0.0052, 0.0058, False)])  # fmt: skip
+def test_a_channel_that_moves_little_counts_by_its_error_beyond_noise(error, own, leaves):
+    sway = SimpleNamespace(rmse=error, own=own, noise=0.0049, spread=0.0144, moves=False)
+    judged = SimpleNamespace(because=(), channels=(sway,))
+    assert _leaves_more(SimpleNamespace(method="oe", prediction=judged)) is leaves
+    # errors of instruments are the noise of their coefficients
+    assert not _leaves_more(SimpleNamespace(method="iv", prediction=judged))
 
 
 def test_logs_are_taken_at_the_pace_of_the_ship():
@@ -193,6 +218,26 @@ def test_thrust_that_goes_with_the_square_of_the_speed_is_told(catamaran):
     assert "thrust ~ n|n|" in choice.note
     assert all(choice.again(fitting) is not None for fitting, _ in parts_of(choice.logs))
     assert sum(row["chosen"] for row in choice.rows) == 1
+
+
+def test_a_path_that_ends_early_decides_no_thrust_law(catamaran, monkeypatch):
+    logs = [log.window(0, 500, log.name) for part in catamaran[:2] for log in part]
+    (few, _), _ = first_terms(force_inputs(logs[0].vessel))
+
+    class Stuck(FreeRunSelection):
+        def __init__(self, logs, *rest):
+            super().__init__(logs, *rest)
+            self.law = logs[0].vessel.thrusters[0].thrust
+
+        def path(self, first, *rest, **more):
+            sets = super().path(first, *rest, **more)
+            return sets[:1] if first == few and self.law.kind == "quadratic" else sets
+
+    monkeypatch.setattr(term_selection, "FreeRunSelection", Stuck)
+    choice = select_terms(logs, "nothing", 0, Refit(lambda _: _still(logs[0])))
+    errors = {law.kind: error for law, error in choice.laws if not law.quadratic_share}
+    assert errors["quadratic"] < errors["linear"]
+    assert choice.logs[0].vessel.thrusters[0].thrust.kind == "quadratic"
 
 
 @pytest.mark.long
