@@ -237,7 +237,7 @@ def case(name: str, effect: str, seed: int, switches: Sequence[str]) -> dict[str
     return {
         "ship": name, "effect": effect, "seed": seed, "share": float(shares.max()),
         "counts": bool((moves & (shares >= COUNTS)).any()),
-        "budget": _budget(found["budget"], true, shares), "verdict": found["verdict"],
+        "budget": _budget(found["budget"], planted, shares), "verdict": found["verdict"],
         "causes": ids, "groups": groups,
         "partial": [c["id"] for c in found["partial"]],
         "stands": bool(true & {*ids, *(c for g in groups for c in g)}),
@@ -273,12 +273,17 @@ def _fits(logs: Sequence[TrialLog]) -> list[float]:
 
 
 def _budget(
-    parts: Sequence[dict[str, Any]], true: set[str], shares: Sequence[float]
+    parts: Sequence[dict[str, Any]], planted: Planted, shares: Sequence[float]
 ) -> list[tuple[float, float, float, float]]:
-    """Return the share of the planted cause by state: measured, told, and its interval."""
+    """Return the share of the planted cause by state: measured, told, and its interval.
+
+    What else it may be called counts only where it does not stand by its own name.
+    """
+    ids = {part["part"].split(":")[0] for part in parts}
+    names = {planted.cause} if planted.cause in ids else {*planted.also}
     return [
         (measured, part["share"][state], *part["ci"][state])
-        for part in parts if part["part"].split(":")[0] in true
+        for part in parts if part["part"].split(":")[0] in names
         for state, measured in zip(part["share"], map(float, shares), strict=True)
     ]  # fmt: skip
 

@@ -110,9 +110,11 @@ def _late(case: DiagnosisProblem, found: Search) -> list[Candidate]:
         hypothesis, fit = cause.hypothesis, found.final
         if not hypothesis.past:
             continue
-        value = fit.point.values[[h.key for h in fit.point.hypotheses].index(hypothesis.key)]
+        k = [h.key for h in fit.point.hypotheses].index(hypothesis.key)
         told = quantities_of(case.problem(fit.integrator), cause, fit)
-        out.append(replace(cause, hypothesis=hypothesis.held_at(value), told=told))
+        # with the convention of sampling that the fit ended with
+        held = fit.point.hypotheses[k].held_at(fit.point.values[k])
+        out.append(replace(cause, hypothesis=held, told=told))
     return out
 
 
