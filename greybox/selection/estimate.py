@@ -263,7 +263,6 @@ def _leaves_more(estimate: Estimate) -> bool:
     return any(
         beyond(c.rmse, c.noise, c.spread) > _SMALL and beyond(c.own, c.noise, c.spread) > _OWN
         for c in judged.channels
-        if c.moves
     )
 
 

@@ -39,6 +39,8 @@ _log = logging.getLogger(__name__)
 
 # terms at most, and those with which thrust laws are compared
 _MOST, FEW = 40, 18
+# times the squared error of the better path at which a path has ended in a local minimum
+_LOST = 2.0
 # samples that a coefficient needs
 _SAMPLES = 20
 # share by which the error may be larger with the thrust that propeller theory gives, ~ n|n|
@@ -179,7 +181,8 @@ def select_terms(
     with within(_FOR_PRESENT * seconds_left()):
         Refit.ahead([refit], [fitting for fitting, _ in parts])
         present_score = [_present_score(refit, *part, spread) for part in parts]
-    turns = -(-len(laws) // lanes()) * (len(laws) > 1)
+    few_tasks = [(of, b) for of in laws for b in range(len(beginnings)) if len(laws) > 1]
+    turns = -(-len(few_tasks) // lanes())
     watch = _Watch(turns + -(-len(beginnings) * (1 + len(parts)) // lanes()))
 
     def path_of(task: tuple[Sequence[TrialLog], str, int]) -> list[Selected]:
@@ -189,8 +192,8 @@ def select_terms(
         chosen_on = selection
         if of is not logs:
             chosen_on = FreeRunSelection(of, family, kind)
-        elif begun == 0:
-            passed = of_laws[laws.index(law)]
+        else:
+            passed = few.get((law, begun), [])
         try:
             with watch.next(what):
                 return chosen_on.path(beginnings[begun], stay, most, passed=passed)
@@ -201,20 +204,22 @@ def select_terms(
             _log.info("no path from %d terms: %s", len(beginnings[begun]), error)
             return []
 
-    def few_terms(of: ThrustLaw) -> list[Selected]:
-        """Return the path to few terms with a thrust law, empty where time is over before."""
+    def few_terms(task: tuple[ThrustLaw, int]) -> list[Selected]:
+        """Return the path to few terms with a thrust law, empty where there is none in time."""
+        of, begun = task
         selection = FreeRunSelection(with_law(logs, of), family, kind)
         try:
             with watch.next(f"thrust ~ {law_in_words(of)}"):
-                return selection.path(beginnings[0], stay, min(FEW, most))
-        except OutOfTimeError:
+                return selection.path(beginnings[begun], stay, min(FEW, most))
+        except GreyboxError:
             return []
 
+    few = dict(zip(few_tasks, watch.over(few_terms, few_tasks), strict=True)) if few_tasks else {}
     law, errors = laws[0], [np.nan]
-    of_laws: list[list[Selected]] = [[]]
-    if len(laws) > 1:
-        of_laws = watch.over(few_terms, laws)
-        errors = [sets[-1].cost if sets else np.inf for sets in of_laws]
+    if few:
+        # a path may end where no term helps: the better beginning counts
+        ends = np.array([sets[-1].cost if sets else np.inf for sets in few.values()])
+        errors = ends.reshape(len(laws), -1).min(axis=1).tolist()
         best_law = int(np.argmin(errors))
         law = laws[-1] if errors[-1] < (1 + _NEAR) * errors[best_law] else laws[best_law]
     logs = with_law(logs, law)
@@ -230,7 +235,13 @@ def select_terms(
             f"no free run of selected terms stays bounded on the {len(logs)} logs: use longer "
             f"logs, or name a structure with --structure."
         )
-    alternatives = [(b, n) for b, sets in enumerate(whole) for n in {len(s.terms) for s in sets}]
+    # runs on parts do not show that the path on all logs ended in a local minimum
+    alternatives = [
+        (b, n)
+        for b, sets in enumerate(whole)
+        for n in {len(s.terms) for s in sets}
+        if _error(sets, n) <= _LOST * min(_error(others, n) for others in whole)
+    ]
     scores: list[list[float]] = [[] for _ in alternatives]
     for path, (_, held) in zip(paths, _judging_parts(logs), strict=True):
         judged = FreeRunSelection(held, family, kind)
@@ -253,14 +264,14 @@ def select_terms(
     assert best is not None
     shorter = [_of_size(path[begun], size_shown) for path in paths]
     named = {name for found in shorter if found for name in found.terms}
-    few = replace(family, terms=tuple(t for t in family.terms if t.name in named))
+    reduced = replace(family, terms=tuple(t for t in family.terms if t.name in named))
 
     def score_step(step: Step) -> Array:
         """Return the weighted scores of these terms, fitted again on each part's other logs."""
         score = []
         for found, part in zip(shorter, _judging_parts(logs), strict=True):
             fitting, held = (
-                FreeRunSelection(with_commands(of, step.commands), few, kind, step.integrator)
+                FreeRunSelection(with_commands(of, step.commands), reduced, kind, step.integrator)
                 for of in part
             )
             errors: list[Array] = []
@@ -410,6 +421,12 @@ def _of_size(sets: Sequence[Selected], size: int) -> Selected | None:
     """Return the set of best fit with at most so many terms, None where there is none."""
     small = [s for s in sets if len(s.terms) <= size]
     return min(small, key=lambda s: s.cost, default=None)
+
+
+def _error(sets: Sequence[Selected], size: int) -> float:
+    """Return the squared error of the set of best fit with at most so many terms."""
+    found = _of_size(sets, size)
+    return found.cost if found else np.inf
 
 
 def _present_score(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,8 +15,9 @@ from greybox.estimation.output_error import OutputErrorOptions
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.model import load_model
 from greybox.model.run.simulation import simulate
+from greybox.selection import term_selection
 from greybox.selection.cross_validation import Refit, parts_of
-from greybox.selection.estimate import at_own_pace, estimate_model, nominal_model
+from greybox.selection.estimate import _leaves_more, at_own_pace, estimate_model, nominal_model
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection
 from greybox.selection.term_selection import select_terms
@@ -158,6 +160,16 @@ def test_a_published_structure_stays_where_it_follows_within_noise():
     assert not any("selected" in note for note in found.notes)
 
 
+@pytest.mark.parametrize(("error", "own", "leaves"), [(0.006, 0.0058, True), (0.006, 0.005, False),
+                                                     (0.0052, 0.0058, False)])  # fmt: skip
+def test_a_channel_that_moves_little_counts_by_its_error_beyond_noise(error, own, leaves):
+    sway = SimpleNamespace(rmse=error, own=own, noise=0.0049, spread=0.0144, moves=False)
+    judged = SimpleNamespace(because=(), channels=(sway,))
+    assert _leaves_more(SimpleNamespace(method="oe", prediction=judged)) is leaves
+    # errors of instruments are the noise of their coefficients
+    assert not _leaves_more(SimpleNamespace(method="iv", prediction=judged))
+
+
 def test_logs_are_taken_at_the_pace_of_the_ship():
     vessel = vessel_from_dict(
         {"name": "boat", "length": 10.0, "thruster": [{"type": "fixed", "speed": "n"}]}
@@ -193,6 +205,29 @@ def test_thrust_that_goes_with_the_square_of_the_speed_is_told(catamaran):
     assert "thrust ~ n|n|" in choice.note
     assert all(choice.again(fitting) is not None for fitting, _ in parts_of(choice.logs))
     assert sum(row["chosen"] for row in choice.rows) == 1
+
+
+def test_a_path_that_ends_in_a_local_minimum_decides_nothing(catamaran, monkeypatch):
+    logs = [log.window(0, 500, log.name) for part in catamaran[:2] for log in part]
+    (few, most), _ = first_terms(force_inputs(logs[0].vessel))
+
+    class Lost(FreeRunSelection):
+        def __init__(self, logs, *rest):
+            super().__init__(logs, *rest)
+            self.law = logs[0].vessel.thrusters[0].thrust
+
+        def path(self, first, *rest, **more):
+            sets = super().path(first, *rest, **more)
+            lost = first == few and self.law.kind == "quadratic"
+            return [replace(s, cost=9 * s.cost) for s in sets] if lost else sets
+
+    monkeypatch.setattr(term_selection, "FreeRunSelection", Lost)
+    choice = select_terms(logs, "nothing", 0, Refit(lambda _: _still(logs[0])))
+    errors = {law.kind: error for law, error in choice.laws if not law.quadratic_share}
+    assert errors["quadratic"] < errors["linear"]
+    assert choice.logs[0].vessel.thrusters[0].thrust.kind == "quadratic"
+    sizes = [row["coefficients"] for row in choice.rows if row["coefficients"] >= len(most)]
+    assert len(sizes) == len(set(sizes)) > 3
 
 
 @pytest.mark.long
