@@ -379,6 +379,8 @@ def build_envelope(
             f"{100 * (1 - inside.mean()):.0f} % of the usual manoeuvres: estimate it on a longer "
             f"trial, or use --prior none."
         )
+    # a run that has left them once says nothing of the envelope
+    inside = np.logical_and.accumulate(inside, axis=1)
     x = motion.state[:, :-1, :nx][inside]
     signals = np.concatenate([x, motion.commands[inside]], axis=-1)
     features = _Features(rollout, predictor, signals[::7], seed)

@@ -153,9 +153,8 @@ class FreeRunSelection:
         for i in self.model.predictor.parameter_columns:
             terms = [family.terms[family.index(t)] for t in self.model.columns[i].terms]
             if all(t.dissipates for t in terms):
-                # damping takes energy out, and within one sample no more than there is
+                # damping takes energy out
                 self._most[i] = 0.0
-                self._least[i] = -1.0 if all(len(t.factors) == 1 for t in terms) else -np.inf
 
     def path(
         self,
@@ -397,13 +396,12 @@ class FreeRunSelection:
         least, most = self._least[out], self._most[out]
         known &= np.where(slope > 0, most > 0, least < 0)
         gains = np.where(known, 0.5 * slope**2 / np.where(known, left, 1.0), 0.0)
-        brakes = (most == 0) & (least <= -1)
+        brakes = (most == 0) & np.isneginf(least)
         for i in np.argsort(-gains * np.where(brakes, _BRAKES, 1.0))[:_TRIED]:
             tried = np.append(index, out[i])
             if self._share(-gains[i]) > 1 - earns or frozenset(tried.tolist()) in seen:
                 continue
-            # where the free run is far from its quadratic model a shorter step may lead downhill
-            moved = self._damped(runs, at, tried)
+            moved = self._moved(runs, at, at.solution(hessian, gradient, tried), tried.tolist())
             if moved is None or self._share(moved.cost - at.cost) > 1 - earns:
                 continue
             return int(out[i]), self._damped(runs, moved, tried) or moved

@@ -39,6 +39,8 @@ _log = logging.getLogger(__name__)
 
 # terms at most, and those with which thrust laws are compared
 _MOST, FEW = 40, 18
+# times the squared error of the better path at which a path has ended in a local minimum
+_LOST = 2.0
 # samples that a coefficient needs
 _SAMPLES = 20
 # share by which the error may be larger with the thrust that propeller theory gives, ~ n|n|
@@ -233,7 +235,13 @@ def select_terms(
             f"no free run of selected terms stays bounded on the {len(logs)} logs: use longer "
             f"logs, or name a structure with --structure."
         )
-    alternatives = [(b, n) for b, sets in enumerate(whole) for n in {len(s.terms) for s in sets}]
+    # runs on parts do not show that the path on all logs ended in a local minimum
+    alternatives = [
+        (b, n)
+        for b, sets in enumerate(whole)
+        for n in {len(s.terms) for s in sets}
+        if _error(sets, n) <= _LOST * min(_error(others, n) for others in whole)
+    ]
     scores: list[list[float]] = [[] for _ in alternatives]
     for path, (_, held) in zip(paths, _judging_parts(logs), strict=True):
         judged = FreeRunSelection(held, family, kind)
@@ -413,6 +421,12 @@ def _of_size(sets: Sequence[Selected], size: int) -> Selected | None:
     """Return the set of best fit with at most so many terms, None where there is none."""
     small = [s for s in sets if len(s.terms) <= size]
     return min(small, key=lambda s: s.cost, default=None)
+
+
+def _error(sets: Sequence[Selected], size: int) -> float:
+    """Return the squared error of the set of best fit with at most so many terms."""
+    found = _of_size(sets, size)
+    return found.cost if found else np.inf
 
 
 def _present_score(
