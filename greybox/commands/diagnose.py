@@ -149,13 +149,15 @@ def run(options: argparse.Namespace) -> None:
         ),
     )
     record = provenance(options) | {"logs": _read(logs), "validate": _read(validate)}
-    vessel_typed, stem = typed(record, "vessel", "V"), Path(options.out or "MODEL").with_suffix("")
+    model_file = Path(options.out or "mended.json")
     steps = [
-        step.replace("--vessel V", f"--vessel {vessel_typed}")
-        .replace("--model MODEL", f"--model {typed(record, 'out', 'MODEL')}")
-        .replace("MODEL.", f"{quote(str(stem))}.")
+        step.replace("--vessel V", f"--vessel {typed(record, 'vessel', 'V')}")
+        .replace("--model MODEL", f"--model {quote(str(model_file))}")
+        .replace("MODEL.", f"{quote(str(model_file.with_suffix('')))}.")
         for step in diagnosis.next_steps
     ]
+    if not options.out and any("MODEL" in step for step in diagnosis.next_steps):
+        steps.insert(0, f"write the models to files: {record['line']} --out {model_file}")
     diagnosis = replace(
         diagnosis, next_steps=tuple(steps), notes=(*left_out, *also, *diagnosis.notes)
     )
