@@ -199,7 +199,7 @@ def measure_zigzag(
     notes = []
     if not approach.seen:
         notes.append(
-            "the log starts with the zig-zag: heading and speed before it are its first ones"
+            "no straight approach before the zig-zag: heading and speed are those at its start"
         )
     if track.integrated:
         notes.append("positions are integrated from u, v and heading, none were measured")
