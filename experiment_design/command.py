@@ -12,6 +12,7 @@ from experiment_design.criteria.optimality import CRITERIA
 from experiment_design.information.estimators import ESTIMATORS
 from experiment_design.request.exclusions import COEFFICIENTS, require_compatible, spelt
 from greybox.commands.common import (
+    VESSEL_HELP,
     add_cluster,
     add_seed,
     count,
@@ -152,7 +153,7 @@ def _declare(
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
-    add("--vessel", required=True, metavar="V", help="vessel file (TOML) with limits")
+    add("--vessel", required=True, metavar="V", help=f"{VESSEL_HELP}; with limits")
     add("--model", metavar="MODEL", help="prior model: a file of greybox estimate")
     add(
         "--duration",

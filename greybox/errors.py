@@ -80,9 +80,15 @@ class ConfigurationError(GreyboxError, ValueError):
 
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Return `` Did you mean 'x'?`` for the known name nearest to `name`, or ``""``."""
+    found = nearest(name, known)
+    return f" Did you mean '{found}'?" if found else ""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return the known name nearest to `name`, or ``""`` where none is near."""
     folded = {k.casefold(): k for k in known}
     near = get_close_matches(name.casefold(), list(folded), n=1, cutoff=0.6)
     # a unit behind the name is the usual difference, as in 'psi [deg]'
     longer = [k for k in folded if k.startswith((f"{name.casefold()} ", f"{name.casefold()}_"))]
     found = near or longer[:1]
-    return f" Did you mean '{folded[found[0]]}'?" if found else ""
+    return folded[found[0]] if found else ""

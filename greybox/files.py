@@ -19,7 +19,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from greybox.errors import LogError, suggestion
+from greybox.errors import LogError, nearest
 
 _MOST_NAMES = 10_000
 # largest file that is read as a whole
@@ -65,7 +65,12 @@ def nearest_file(path: str | Path, known: Iterable[str] = ()) -> str:
         beside = [p.name for p in islice(path.parent.iterdir(), _MOST_NAMES)]
     except (OSError, ValueError):
         beside = []
-    return suggestion(path.name, [*known, *beside])
+    names = [*known, *beside]
+    # an ending that they share makes no names alike
+    stems = {Path(n).stem: n for n in names if Path(n).suffix == path.suffix}
+    others = [n for n in names if n not in stems.values()]
+    found = stems.get(nearest(path.stem, stems), "") or nearest(path.name, others)
+    return f" Did you mean '{found}'?" if found else ""
 
 
 def make_folder(path: str | Path) -> Path:

@@ -141,12 +141,10 @@ def make_schedule(vessel: Vessel, duration: float, hold: float, sample_time: flo
             f"use --duration {2 * hold:g} or more, or a shorter --hold."
         )
     lower, upper, ramp, reach = [], [], [], []
+    _require_limits(vessel)
     for name, limits in vessel.limits.items():
-        if limits.lower is None or limits.upper is None:
-            raise VesselError(
-                f"'{name}' has no limits, and a sequence must stay within some: add "
-                f"speed_limits, angle_limits or rudder_limits to its thruster in the vessel file."
-            )
+        assert limits.lower is not None
+        assert limits.upper is not None
         if limits.upper < limits.lower:
             raise VesselError(
                 f"the limits of '{name}' contradict: the lower one is {limits.lower:g}, the upper "
@@ -166,3 +164,19 @@ def make_schedule(vessel: Vessel, duration: float, hold: float, sample_time: flo
         tuple(vessel.limits), sample_time, samples, held, np.array(lower), np.array(upper),
         tuple(ramp), np.array(reach),
     )  # fmt: skip
+
+
+def _require_limits(vessel: Vessel) -> None:
+    """Raise where commands have no limits, with the lines that give them some."""
+    kinds = {column: kind for t in vessel.thrusters for kind, column, _, _ in t.movements}
+    lacking = [n for n, x in vessel.limits.items() if x.lower is None or x.upper is None]
+    if lacking:
+        lines = (
+            f"{kinds[n]}_limits = [LEAST, MOST]{'' if kinds[n] == 'speed' else ' in rad'} for '{n}'"
+            for n in lacking
+        )
+        raise VesselError(
+            f"{', '.join(map(repr, lacking))} {'has' if len(lacking) == 1 else 'have'} no limits, "
+            f"and a sequence must stay within some: write {', '.join(lines)} under [[thruster]] in "
+            f"the vessel file."
+        )

@@ -168,6 +168,7 @@ def _trial(design: Design, band: MotionBand) -> Section:
         f"the prior{' with process noise' if r.noise.process.any() else ''}"
         + (f"; {band.lost} more ran away and are left out." if band.lost else ".")
     )
+    outlines = "" if band.certain else " The thin outlines are its parts at the numbered times."
     cells = ", ".join(
         f"{n} from {signed(band[n].nominal.min(), 2)} to {signed(band[n].nominal.max(), 2)}"
         for n in names
@@ -178,7 +179,7 @@ def _trial(design: Design, band: MotionBand) -> Section:
         pictures=[
             Picture(
                 to_svg(track, f"plan{tag}"),
-                f"Expected track, north up, with the time in numbers. {certain}",
+                f"Expected track, north up, with the time in numbers. {certain}{outlines}",
                 f"Map: the expected track covers {np.ptp(north):.0f} m from south to north and "
                 f"{np.ptp(east):.0f} m from west to east in {clock(float(band.t[-1]))} minutes.",
                 chart=chart_of(track),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from greybox.commands.common import add_memory, provenance, say
+from greybox.commands.common import VESSEL_HELP, add_memory, provenance, say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="logs, or raw files of any format; folders and patterns stand for the logs in them; "
         "those of one ship are judged together",
     )  # fmt: skip
-    parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
+    parser.add_argument("--vessel", required=True, metavar="V", help=VESSEL_HELP)
     parser.add_argument("--json", metavar="F", help="write the findings as JSON; - is stdout")
     parser.add_argument("--report", metavar="HTML", help="write a page with a picture per finding")
     add_memory(

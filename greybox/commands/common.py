@@ -20,12 +20,13 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "add_cluster", "add_logs", "add_memory", "add_outputs", "add_seed", "complain", "count",
-    "positive", "progress", "provenance", "publish", "read_logs", "say",
+    "VESSEL_HELP", "add_cluster", "add_logs", "add_memory", "add_outputs", "add_seed", "complain",
+    "count", "positive", "progress", "provenance", "publish", "read_logs", "say",
 ]  # fmt: skip
 
 # GiB that logs and what is made of them may take by default, those of a usual machine
 _MEMORY = 4.0
+VESSEL_HELP = "vessel file (TOML), as 'greybox import --help' shows one, or thesis or ferry"
 # where a command computes changes no result
 SHELL_ONLY = (
     "run", "typed", "verbose", "more_verbose", "quiet", "no_config", "configuration", "cluster",
@@ -41,7 +42,7 @@ def add_logs(parser: argparse.ArgumentParser) -> None:
         help="logs, CSV or Parquet: files, folders, patterns in quotes, or addresses such as "
         "s3://bucket/folder",
     )
-    parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
+    parser.add_argument("--vessel", required=True, metavar="V", help=VESSEL_HELP)
 
 
 def add_outputs(parser: argparse.ArgumentParser, result: str, page: str) -> None:

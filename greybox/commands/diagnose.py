@@ -19,6 +19,8 @@ from greybox.commands.common import (
 from greybox.public import one_thread
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from greybox.diagnosis.result import Diagnosis
     from greybox.report.page import Page
     from greybox.selection.stretches import Drawn
@@ -93,8 +95,6 @@ def run(options: argparse.Namespace) -> None:
     """Read, diagnose, report, write."""
     from dataclasses import replace
     from functools import partial
-    from pathlib import Path
-    from shlex import quote
 
     from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
     from greybox.files import check_targets
@@ -102,7 +102,6 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.model import load_model
     from greybox.numerics.memory import keep_freed_memory
     from greybox.numerics.parallel import ahead
-    from greybox.report.page import typed
     from greybox.selection.estimate_stream import BYTES
     from greybox.selection.stretches import draw
     from greybox.trial.log_files import find_logs
@@ -149,13 +148,7 @@ def run(options: argparse.Namespace) -> None:
         ),
     )
     record = provenance(options) | {"logs": _read(logs), "validate": _read(validate)}
-    vessel_typed, stem = typed(record, "vessel", "V"), Path(options.out or "MODEL").with_suffix("")
-    steps = [
-        step.replace("--vessel V", f"--vessel {vessel_typed}")
-        .replace("--model MODEL", f"--model {typed(record, 'out', 'MODEL')}")
-        .replace("MODEL.", f"{quote(str(stem))}.")
-        for step in diagnosis.next_steps
-    ]
+    steps = _with_files(diagnosis.next_steps, record)
     diagnosis = replace(
         diagnosis, next_steps=tuple(steps), notes=(*left_out, *also, *diagnosis.notes)
     )
@@ -169,6 +162,26 @@ def run(options: argparse.Namespace) -> None:
 
     told = diagnosis.to_dict() | told | {"provenance": record}
     publish(options, told, diagnosis.summary(), page, [options.out])
+
+
+def _with_files(steps: Sequence[str], record: Mapping[str, Any]) -> list[str]:
+    """Return next steps with the user's own files, first the one that writes the models."""
+    from pathlib import Path
+    from shlex import quote
+
+    from greybox.report.page import typed
+
+    out = record["command"].get("out")
+    model = Path(out or "mended.json")
+    filled = [
+        step.replace("--vessel V", f"--vessel {typed(record, 'vessel', 'V')}")
+        .replace("--model MODEL", f"--model {quote(str(model))}")
+        .replace("MODEL.", f"{quote(str(model.with_suffix('')))}.")
+        for step in steps
+    ]
+    if not out and any("MODEL" in step for step in steps):
+        filled.insert(0, f"write the models to files: {record['line']} --out {model}")
+    return filled
 
 
 def _drawn_from(drawn: Drawn) -> str:

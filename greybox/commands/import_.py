@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from greybox.commands.common import positive, provenance, say
+from greybox.commands.common import VESSEL_HELP, positive, provenance, say
 
 if TYPE_CHECKING:
     from greybox.trial.convert.options import ImportOptions
@@ -21,6 +21,20 @@ EXAMPLES = """examples:
 Files of one trial are merged on their clocks; where --out is a folder, each file becomes a log.
 Columns are found by the vessel file's [columns], by canonical name, or guessed; every guess is
 stated. Gaps stay gaps.
+
+A vessel file, such as ship.toml, needs name, length and thrusters; [columns] says what the raw
+files call a column, and in which unit it is. docs/vessel.md has the other keys:
+
+  name = "My ship"
+  length = 8.0                          # m
+  [[thruster]]
+  type = "propeller_rudder"             # or azimuth (angle in place of rudder), fixed, tunnel
+  x = -3.5                              # m from the origin of the velocities, forward positive
+  speed = "n"                           # the log's columns
+  rudder = "delta"
+  [columns]
+  "Shaft RPM" = "n"
+  "Rudder angle" = { name = "delta", unit = "deg" }
 """
 
 
@@ -32,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RAW",
         help="raw files of one trial; where --out is a folder, each file is a trial",
     )
-    parser.add_argument("--vessel", required=True, metavar="V", help="vessel file (TOML)")
+    parser.add_argument("--vessel", required=True, metavar="V", help=VESSEL_HELP)
     parser.add_argument(
         "--out",
         required=True,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -116,14 +117,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if "_ARGCOMPLETE" in os.environ:
         offer(build_parser())
-    name = "greybox"
+    name, vessel = "greybox", "V"
     try:
         options = _parse(list(sys.argv[1:] if arguments is None else arguments))
-        name = f"greybox {options.command}"
+        name, vessel = f"greybox {options.command}", getattr(options, "vessel", None) or "V"
         with telling(options.verbose + getattr(options, "more_verbose", 0), options.quiet):
             _run(options)
     except GreyboxError as error:
-        complain(f"{name}: {error}")
+        told = str(error).replace("--vessel V ", f"--vessel {shlex.quote(vessel)} ")
+        complain(f"{name}: {told}")
         return 1
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -77,6 +77,13 @@ class Parser(argparse.ArgumentParser):
                 f"{suggestion(value, known)} Known: {', '.join(known)}"
             )
 
+    def _wanted(self, name: str) -> str:
+        """Return what is missing, with what it is."""
+        action = next(a for a in self._actions if argparse._get_action_name(a) == name)
+        told = (action.help or "").replace("%%", "%").split(";")[0]
+        known = f" ({', '.join(map(str, action.choices))})" if action.choices else ""
+        return f"{name} is missing{': ' * bool(told)}{told}{known}"
+
     def error(self, message: str) -> NoReturn:
         """Exit with status 2 and one sentence, or raise one about the configuration file."""
         for pattern, sentence in _SENTENCES.items():
@@ -84,6 +91,8 @@ class Parser(argparse.ArgumentParser):
         if found := re.match("unrecognized arguments: ([^ =]*)", message):
             near = suggestion(found[1], self._option_string_actions)
             message = f"there is no option '{found[1]}'.{near}"
+        if found := re.match("the following arguments are required: (.*)", message):
+            message = "; ".join(self._wanted(name) for name in found[1].split(", "))
         message += "." * (not message.endswith((".", "?")))
         if self.place:
             raise ConfigurationError(f"{self.place}: {re.sub('^argument [^:]*: ', '', message)}")

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "manoeuvre",
         choices=("turning", "zigzag", "stopping", "crash"),
-        help="stopping: with the thrust taken off; crash: with full astern",
+        help="the manoeuvre to predict; stopping: thrust taken off; crash: full astern",
     )
     add_outputs(parser, "the quantities", "tracks and histories")
     parser.add_argument(
@@ -172,9 +172,11 @@ def run(options: argparse.Namespace) -> None:
     written = _write_runs(made, options.out) if options.out else []
 
     def page() -> Page:
+        from greybox.report.page import typed
         from greybox.report.prediction import prediction_page
 
-        return prediction_page(made, record)
+        vessel = typed(model.record.get("provenance", {}), "vessel", "V")
+        return prediction_page(made, record, vessel)
 
     publish(options, made.to_dict() | {"provenance": record}, made.summary(), page, written)
 

@@ -124,6 +124,8 @@ def prepare(
     causes = _chosen(ids)
     if model is None:
         require_commands(logs)
+    else:
+        _require_ship(model, [*logs, *validate])
     kinematics = judged_by_kinematics([*logs, *validate])
     findings = [f for f in kinematics.findings if f.id in causes]
     vessel = mended(logs[0].vessel if model is None else model.vessel, findings)
@@ -228,3 +230,14 @@ def _case(
         "basic+wind" if wind and structure.uses_air else "basic",
         tuple((s, both) for s in structure.states),
     )  # fmt: skip
+
+
+def _require_ship(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> None:
+    """Raise where a log lacks a column that moves the thrusters of the model's ship."""
+    for log in logs:
+        if lacking := [c for c in model.vessel.commands if c not in log]:
+            raise LogError(
+                f"log '{log.name}' has no {', '.join(map(repr, lacking))}, which moves the "
+                f"thrusters of the model's ship, '{model.vessel.name}': give a model of "
+                f"'{log.vessel.name}', or leave --model out."
+            )

@@ -135,6 +135,12 @@ def cramer_rao(
 
 
 def _limit(names: Sequence[str], bound: Array, covariance: Array) -> EfficiencyBound:
+    free = np.diag(covariance) > 0
+    if free.any() and not free.all():
+        # what ended at its bound was not estimated
+        names = [n for n, f in zip(names, free, strict=True) if f]
+        bound = scaled_inverse(scaled_inverse(bound)[np.ix_(free, free)])
+        covariance = covariance[np.ix_(free, free)]
     std = np.sqrt(np.diag(bound))
     reported = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     efficiency = np.where(reported > 0, (std / np.where(reported > 0, reported, 1.0)) ** 2, 0.0)

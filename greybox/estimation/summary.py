@@ -151,9 +151,10 @@ def _table(estimate: EstimateValues) -> list[str]:
                 continue
             value, std = estimate.theta[i], errors[i]
             term = structure.terms[structure.index(column.terms[0])]
+            known = f"{std:>9.2g}{value - 1.96 * std:>11.4g}{value + 1.96 * std:>11.4g}"
             lines.append(
-                f"{column.label:<{named}}{value:>10.4g}{std:>9.2g}{value - 1.96 * std:>11.4g}"
-                f"{value + 1.96 * std:>11.4g}"
+                f"{column.label:<{named}}{value:>10.4g}"
+                f"{known if std > 0 else ' at bound'.ljust(31)}"
                 f"{set_in_words(sets.get(column.label)):>{safe}}"
                 f"{value / estimate.sample_time:>11.4g}  {parameter_unit(term, unit)}"
             )

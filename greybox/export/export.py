@@ -121,6 +121,11 @@ def export_model(
         raise UsageError(f"'{to}' is written to a file: name one instead of '-'.")
     model = model.at_final_parameters() if settled else model
     path = Path(out)
+    if path.suffix.casefold() in {f".{t}" for t in TARGETS} - {f".{to}"}:
+        raise UsageError(
+            f"'{out}' ends as another format than '{to}': name a file that ends in .{to}, or "
+            f"export to {path.suffix[1:].casefold()}."
+        )
     check_targets(out)
     if to == "fmu":
         sampled = sampled_model(model, heading="either", wind="either")

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
-from scipy.stats import chi2, qmc
+from scipy.stats import chi2, qmc, t
 
 from greybox.errors import UsageError
 from greybox.fleet.pooling import Pooled, pool
@@ -141,6 +141,18 @@ def compare_units(estimates: Array, covariances: Array) -> tuple[Comparison, ...
         adjusted = min(1.0, max(adjusted, one.p_value * (len(remaining) - place)))
         done[one.unit] = replace(one, p_adjusted=adjusted, differences=())
     return tuple(done[unit] for unit in range(len(estimates)))
+
+
+def least_deviation(units: int, size: int) -> float:
+    """Return by how many standard deviations one coefficient must deviate to be named.
+
+    Parameters
+    ----------
+    units, size : int
+        Units that are compared, and coefficients of each; the errors of the estimates are small.
+    """
+    alone = SIGNIFICANCE / (2 * size * units)
+    return float(t.isf(alone / 2, units - 2) * np.sqrt(1 + 1 / (units - 1)))
 
 
 def _against_others(

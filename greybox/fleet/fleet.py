@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import GreyboxError
 from greybox.estimation.result import Estimate
-from greybox.fleet.differing import SIGNIFICANCE, Comparison, compare_units
+from greybox.fleet.differing import SIGNIFICANCE, Comparison, compare_units, least_deviation
 from greybox.fleet.pooling import Pooled, pool
 from greybox.fleet.ships import LeftOut, ShipFiles, find_ships, require_ships
 from greybox.fleet.trend import FEWEST_PERIODS, Trend, fit_trend
@@ -36,6 +36,8 @@ _log = logging.getLogger(__name__)
 _PILOTS = 3
 # periods of a ship at most: as many as a picture shows, each of whole logs
 _MOST_PERIODS = 12
+# ships named in one sentence
+_MOST_NAMED = 5
 _YEAR = 365.25 * 86400.0
 
 
@@ -231,6 +233,29 @@ class Fleet(DisplayMixin):
             return f"{told}; no coefficient of the {followed} ships followed in time changes"
         return told
 
+    @property
+    def cautions(self) -> tuple[str, ...]:
+        """How far the numbers can be trusted, a sentence each."""
+        told = []
+        if lost := [s.name for s in self.ships if not all(v > 0 for v in s.fit.values())]:
+            told.append(
+                f"the free run of {_listed(lost)} fits its own logs no better than a constant: "
+                f"rely neither on these coefficients nor on the mean of a class that they are in"
+            )
+        if few := [s.name for s in self.ships if s.logs < FEWEST_PERIODS]:
+            told.append(
+                f"{_listed(few)} has fewer than {FEWEST_PERIODS} logs: what varies from log to log "
+                f"(weather, draught, sensors) is in no standard error there, and may look like a "
+                f"difference between ships"
+            )
+        reach = least_deviation(*self.pooled.theta.shape)
+        told.append(
+            f"among {len(self.pooled.theta)} ships one coefficient must deviate by about "
+            f"{float(f'{reach:.2g}'):.0f} standard deviations before chance is "
+            f"ruled out: a ship that is not named may still differ by less"
+        )
+        return tuple(told)
+
     def rows(self) -> list[dict[str, Any]]:
         """Return the table, a row for each coefficient of each ship."""
         changed = {(c.ship, c.coefficient): c for c in self.changes()}
@@ -306,6 +331,7 @@ class Fleet(DisplayMixin):
             "format": "greybox-fleet",
             "version": 1,
             "verdict": self.verdict,
+            "cautions": list(self.cautions),
             "names": list(self.names),
             "units": list(self.units),
             "model": {
@@ -331,7 +357,8 @@ class Fleet(DisplayMixin):
 
     def summary(self) -> str:
         """Return the result as text: verdict, class, ships, what was left out."""
-        lines = [f"Verdict: {self.verdict}.", "", f"Estimated: {self.model.sentence}", ""]
+        lines = [f"Verdict: {self.verdict}.", *(f"caution: {c}." for c in self.cautions), ""]
+        lines += [f"Estimated: {self.model.sentence}", ""]
         lines += [self.difference_sentence(c) for c in self.differing]
         lines += [
             f"{c.coefficient} of '{c.ship}' changes by {c.slope:+.3g} per {c.per} "
@@ -351,7 +378,9 @@ class Fleet(DisplayMixin):
             )
         lines += ["", f"  {'ship':<20}{'logs':>6}{'distance':>12}{'p adjusted':>12}  fit"]
         for ship, compared in zip(self.ships, self.comparisons, strict=True):
-            fit = ", ".join(f"{k} {v:.0f} %" for k, v in ship.fit.items())
+            fit = ", ".join(
+                f"{k} {v:.0f} %" if v > -1000 else f"{k} diverged" for k, v in ship.fit.items()
+            )
             lines.append(
                 f"  {ship.name:<20}{ship.logs:>6}{np.sqrt(compared.statistic):>12.3g}"
                 f"{compared.p_adjusted:>12.2g}  {fit}"
@@ -361,6 +390,13 @@ class Fleet(DisplayMixin):
 
     def _line(self) -> str:
         return f"fleet '{self.name}': {self.verdict}"
+
+
+def _listed(ships: Sequence[str]) -> str:
+    """Return ships in words, the first few by name."""
+    named = ", ".join(f"'{s}'" for s in ships[:_MOST_NAMED])
+    more = len(ships) - _MOST_NAMED
+    return f"each of {named}{f' and {more} more' if more > 0 else ''}" if ships[1:] else named
 
 
 @dataclass(frozen=True)

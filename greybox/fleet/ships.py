@@ -106,7 +106,9 @@ def require_ships(ships: Sequence[str], left_out: Sequence[LeftOut], folder: str
     if len(ships) >= FEWEST:
         return
     named = f" ({', '.join(ships)})" if ships else ""
-    told = "".join(f" {one.sentence}" for one in left_out)
+    told = "".join(f" {one.sentence}" for one in left_out) or (
+        " Each ship is a folder directly in it, with one vessel file (*.toml) and that ship's logs."
+    )
     raise LogError(
         f"'{folder}' has {len(ships)} ships{named} that can be used, and at least {FEWEST} are "
         f"needed to see how much ships of a class differ.{told} Use greybox estimate for each ship."

@@ -102,6 +102,7 @@ def measure(
     rudder: float | None,
     full_rudder: float | None,
     executes: np.ndarray | None,
+    heading: float | None,
     end_speed: float | None,
     reversed_thrust: bool,
     scale: float,
@@ -118,6 +119,8 @@ def measure(
         Steering angle and the greatest one [rad]; None where no angle steers.
     executes : ndarray or None
         (n,) samples since the order, −1 for those not reached: a zig-zag.
+    heading : float or None
+        At which a zig-zag is reversed [rad].
     end_speed : float or None
         Surge velocity that ends a stop [m/s].
     reversed_thrust : bool
@@ -164,6 +167,7 @@ def measure(
         executes=[float(e) for e in (made[:-1] if len(made) == len(executes) else made)],
         rudder=0.0 if rudder is None else rudder,
         length=length,
+        heading=heading,
         stop=float(runs.t[stop - 1]),
         scale=scale,
         heading_std=0.0,

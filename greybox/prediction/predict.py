@@ -345,8 +345,8 @@ def _trial_current(
         length = model.vessel.length
         own = [
             measure(
-                runs, i, length, rudder=None, full_rudder=None, executes=None, end_speed=None,
-                reversed_thrust=False, scale=1.0,
+                runs, i, length, rudder=None, full_rudder=None, executes=None, heading=None,
+                end_speed=None, reversed_thrust=False, scale=1.0,
             )
             for i in np.flatnonzero(~runs.diverged).tolist()
         ]  # fmt: skip
@@ -401,6 +401,7 @@ def _one(
             rudder=task.order if angular else None,
             full_rudder=helm.greatest if angular else None,
             executes=None if executes is None else executes[run],
+            heading=task.heading,
             end_speed=None if end is None else float(end[run]),
             reversed_thrust=kind == "crash",
             scale=asked.scale,

@@ -58,7 +58,8 @@ def comparison_page(
             )
             for horizon, value in ahead.items():
                 ahead_rows.append(
-                    [name, run.log.name, horizon] + [f"{value[s]:.3g}" for s in states]
+                    [name, run.log.name, horizon]
+                    + [f"{value[s]:.3g}" if np.isfinite(value[s]) else "diverged" for s in states]
                 )
     tables = [
         Table(
@@ -122,7 +123,7 @@ def comparison_page(
         ],
         pictures=pictures,
         lead=lead,
-        next_steps=[_next_step(comparison, record)],
+        next_steps=[_next_step(comparison, models, record)],
         tables=tables,
         texts=[
             (f"Model {name}", model.summary())
@@ -178,14 +179,17 @@ def _pictures(comparison: Comparison) -> list[Picture]:
     return pictures
 
 
-def _next_step(comparison: Comparison, record: Mapping[str, Any]) -> NextStep:
+def _next_step(
+    comparison: Comparison, models: Sequence[ManoeuvringModel], record: Mapping[str, Any]
+) -> NextStep:
     """Return the command that tells why the best model errs where it does."""
-    models = record.get("command", {}).get("models", ())
+    given = record.get("command", {}).get("models", ())
     best = _best(comparison)
-    model = shlex.quote(str(models[best])) if best < len(models) else "MODEL"
+    model = shlex.quote(str(given[best])) if best < len(given) else "MODEL"
+    vessel = typed(models[best].record.get("provenance", {}), "vessel", "V")
     return NextStep(
         f"Find what '{comparison.names[best]}' gets wrong in these logs, and why",
-        f"greybox diagnose {typed(record, 'log', 'LOG…')} --vessel V --model {model} "
+        f"greybox diagnose {typed(record, 'log', 'LOG…')} --vessel {vessel} --model {model} "
         f"--report diagnosis.html",
     )
 

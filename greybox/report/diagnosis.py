@@ -40,6 +40,8 @@ _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
 _UNITS = {"u": "m/s", "v": "m/s", "r": "rad/s", "psi": "rad"}
 # logs of each kind that are drawn: with more the page grows and tells nothing new
 _MOST_LOGS = 3
+# characters of a verdict that leave room for the next step on the first screen
+_LONGEST = 330
 
 
 def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
@@ -63,7 +65,7 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
     ]
     if diagnosis.notes:
         sections.append(Section("Notes", points=diagnosis.notes))
-    headline = diagnosis.headline
+    headline = _headline(diagnosis)
     return Page(
         title="What the simulation gets wrong, and why",
         headline=headline[:1].upper() + headline[1:],
@@ -81,6 +83,15 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
             "memory (Liang and Zeger, 1986)",
         },
     )
+
+
+def _headline(diagnosis: Diagnosis) -> str:
+    """Return the verdict, causes by their titles alone where all of it would fill the screen."""
+    if len(diagnosis.causes) < 2 or len(diagnosis.headline) <= _LONGEST:
+        return diagnosis.headline
+    titles = "; ".join(c.title for c in diagnosis.causes)
+    rest = " They do not explain all of it." if diagnosis.verdict == "partly" else ""
+    return f"{len(diagnosis.causes)} causes stand: {titles}.{rest}"
 
 
 def _step(told: str) -> NextStep:

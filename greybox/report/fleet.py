@@ -43,6 +43,7 @@ def fleet_page(fleet: Fleet, record: Mapping[str, Any]) -> Page:
         title=f"{len(fleet.ships)} ships of one class: what they share and which one differs",
         headline=f"{verdict[0].upper()}{verdict[1:]}.",
         sentences=[
+            *(f"Caution: {c}." for c in fleet.cautions),
             *(_capital(fleet.difference_sentence(c)) for c in fleet.differing),
             f"Every ship was estimated in the same way: {fleet.model.sentence}",
             *(_capital(one.sentence) for one in fleet.left_out),
@@ -189,7 +190,9 @@ def _ships_section(fleet: Fleet) -> Section:
     """Show the ships one by one, and each coefficient of all of them."""
     rows = []
     for ship, compared in zip(fleet.ships, fleet.comparisons, strict=True):
-        fit = ", ".join(f"{k} {v:.0f}" for k, v in ship.fit.items())
+        fit = ", ".join(
+            f"{k} {v:.0f}" if v > -1000 else f"{k} diverged" for k, v in ship.fit.items()
+        )
         named = ", ".join(fleet.names[d.coefficient] for d in compared.differences)
         rows.append(
             [ship.name, str(ship.logs), _number(float(np.sqrt(compared.statistic)), ".3g"),

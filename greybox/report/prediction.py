@@ -39,7 +39,7 @@ _DOUBTS = {
 }
 
 
-def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any]) -> Page:
+def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any], vessel: str = "V") -> Page:
     """Return the page: verdicts in the headline, a section with pictures for each manoeuvre."""
     sections = [_section(m, f"prediction{i}") for i, m in enumerate(made.manoeuvres)]
     lead, *others = sections[0].pictures
@@ -54,12 +54,12 @@ def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any]) -> Page:
               if made.notes else []),
         ],
         lead=replace(lead, caption=f"{sections[0].title}: {lead.caption}"),
-        next_steps=_next_steps(made, record),
+        next_steps=_next_steps(made, record, vessel),
         computed=flatten(record),
     )  # fmt: skip
 
 
-def _next_steps(made: ManoeuvrePrediction, record: dict[str, Any]) -> list[NextStep]:
+def _next_steps(made: ManoeuvrePrediction, record: dict[str, Any], vessel: str) -> list[NextStep]:
     """Return what makes the prediction surer, or puts it to the test."""
     model = typed(record, "model", "MODEL")
     agreements = [m.agreement for m in made.manoeuvres if m.agreement is not None]
@@ -68,15 +68,15 @@ def _next_steps(made: ManoeuvrePrediction, record: dict[str, Any]) -> list[NextS
         steps.append(
             NextStep(
                 "Plan a trial that narrows these intervals",
-                f"greybox design --vessel V --model {model} --duration 900 --out plan.csv",
+                f"greybox design --vessel {vessel} --model {model} --duration 900 --out plan.csv",
             )
         )
     if made.prediction in _DOUBTS or not all(r.agrees for a in agreements for r in a.rows):
         steps.append(
             NextStep(
                 "Find what the model gets wrong, and why",
-                f"greybox diagnose {typed(record, 'trial', 'LOG')} --vessel V --model {model} "
-                f"--report diagnosis.html",
+                f"greybox diagnose {typed(record, 'trial', 'LOG')} --vessel {vessel} "
+                f"--model {model} --report diagnosis.html",
             )
         )
     if not agreements:

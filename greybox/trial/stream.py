@@ -6,6 +6,7 @@ after another, in as many processes as there are processors, by the same way as 
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -327,7 +328,7 @@ def _opened(path: Path) -> TableFile:
     if isinstance(table, Recording | TopicTable):
         raise LogError(
             f"'{path.name}' is a raw file, and rows of a log are needed: make a log of it first "
-            f"with greybox import {path.name} --vessel V --out LOG.parquet."
+            f"with greybox import {shlex.quote(path.name)} --vessel V --out log.parquet."
         )
     return table
 

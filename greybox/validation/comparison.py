@@ -182,7 +182,10 @@ class Comparison(DisplayMixin):
                     s: np.sqrt(np.mean([a[horizon][s] ** 2 for a in aheads if horizon in a]))
                     for s in states
                 }
-                shown = ", ".join(f"{s} {e:.3g} {CHANNELS[s].unit}" for s, e in error.items())
+                shown = ", ".join(
+                    f"{s} {e:.3g} {CHANNELS[s].unit}" if np.isfinite(e) else f"{s} diverged"
+                    for s, e in error.items()
+                )
                 lines.append(f"{name[:23]:<24}{horizon} s ahead, rms error: {shown}")
         lines += self._covered()
         lines += [

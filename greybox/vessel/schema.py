@@ -319,7 +319,7 @@ def _sentence(error: ValidationError, source: str) -> str:
         where = place.where
         if source and place.table is VesselTable:
             where = f"{where} '{source}'"
-        return f"{where} has no '{place.key}': {add} (see the vessel format)."
+        return f"{where} has no '{place.key}': {add}, as 'greybox import --help' shows."
     tag = first.get("ctx", {}).get("tag")
     number, word = place.name, tag or (value if isinstance(value, str) else "")
     if place.table is SensorsTable and len(place.path) == 1:

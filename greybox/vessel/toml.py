@@ -67,7 +67,8 @@ def load_vessel(path: str | Path) -> Vessel:
     except OSError as error:
         raise VesselError(
             f"cannot read the vessel file '{source}': {error.strerror}."
-            f"{nearest_file(source, EXAMPLES)} Name an existing TOML file."
+            f"{nearest_file(source, EXAMPLES)} Name an existing TOML file, or write one with the "
+            f"lines that 'greybox import --help' shows."
         ) from error
     if len(raw) > _MAX_BYTES:
         raise VesselError(
@@ -234,7 +235,8 @@ def _column(raw: str, table: ColumnTable, vessel: Vessel) -> ColumnMapping:
     if table.name not in known:
         raise VesselError(
             f"column '{raw}' is mapped to '{table.name}', which is neither a channel nor a "
-            f"thruster column.{suggestion(table.name, known)}"
+            f"thruster column.{suggestion(table.name, known)} Name one of them, or let a "
+            f"[[thruster]] name '{table.name}' as its speed, angle or rudder: {', '.join(known)}."
         )
     if table.unit is not None:
         try:

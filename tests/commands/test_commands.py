@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,9 @@ from browser import without_scripts
 from schemas import schema
 from virtual import recorded, virtual_log, write_csv
 
+from greybox.commands.diagnose import _with_files
 from greybox.commands.main import main
+from greybox.report.comparison import _next_step
 from greybox.trial.log import make_log
 from greybox.vessel.toml import load_vessel
 
@@ -259,3 +262,35 @@ def test_columns_in_another_unit_are_told_by_every_command_that_reads_logs(tmp_p
             mend = f'"{name}" = {{ name = "{name}", unit = "{unit}" }}'
             assert mend in said, (command[0], mend)
             assert any(mend in line for line in found)
+
+
+def test_next_steps_name_the_files_of_the_user():
+    steps = [
+        "tell apart: greybox design --vessel V --between MODEL.a.json MODEL.b.json --out plan.csv",
+        "plan: greybox design --vessel V --model MODEL --duration 900 --out plan.csv",
+    ]
+    known = {"vessel": "my ship.toml"}
+    record = {"command": known, "line": "greybox diagnose log.csv --vessel 'my ship.toml'"}
+    first, between, plan = _with_files(steps, record)
+    assert first == f"write the models to files: {record['line']} --out mended.json"
+    assert "--vessel 'my ship.toml' --between mended.a.json mended.b.json " in between
+    assert "--vessel 'my ship.toml' --model mended.json " in plan
+    filled = _with_files(steps, record | {"command": known | {"out": "runs/better.json"}})
+    assert "--between runs/better.a.json runs/better.b.json " in filled[0]
+    assert "--model runs/better.json " in filled[1]
+    assert len(filled) == 2
+    model = SimpleNamespace(record={"provenance": record})
+    best = SimpleNamespace(names=["mine"], fits=lambda: [{"u": 80.0}])
+    step = _next_step(best, [model], {"command": {"models": ["mine.json"], "log": ["day 2.csv"]}})
+    assert step.command == (
+        "greybox diagnose 'day 2.csv' --vessel 'my ship.toml' --model mine.json "
+        "--report diagnosis.html"
+    )
+
+
+def test_an_error_about_a_raw_file_tells_the_whole_command(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("my raw.csv").write_text("Time UTC,RPM\n0,1\n1,1\n")
+    assert run("estimate", "my raw.csv", "--vessel", "thesis") == 1
+    told = capsys.readouterr().err
+    assert "greybox import 'my raw.csv' --vessel thesis --out log.csv" in told

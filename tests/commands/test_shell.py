@@ -9,6 +9,7 @@ import re
 import shlex
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,8 @@ from virtual import virtual_log, write_csv
 from greybox.commands import completion
 from greybox.commands.main import build_parser, main
 from greybox.commands.parser import sub_parsers
-from greybox.vessel.toml import EXAMPLES, example_vessel
+from greybox.files import nearest_file
+from greybox.vessel.toml import EXAMPLES, example_vessel, load_vessel
 
 SCRIPT = [sys.executable, "-m", "greybox"]
 COMMANDS = {n: p for n, p in sub_parsers(build_parser()).items() if n != "help"}
@@ -126,7 +128,11 @@ def test_the_parser_imports_nothing_heavy():
         ("estimate trial.csv --vessel s --seed 1.5", "'1.5' is no whole number of at least 0."),
         ("reproduce chapter8", "study 'chapter8' is not known. Did you mean 'chapter"),
         ("simulate m.json a.csv b.csv --out c", "'b.csv' is one argument too many."),
-        ("estimate trial.csv", "the following arguments are required: --vessel."),
+        (
+            "estimate trial.csv",
+            "--vessel is missing: vessel file (TOML), as 'greybox import",
+        ),
+        ("predict model.json", "manoeuvre is missing: the manoeuvre to predict (turning, zigzag, "),
         ("completion bsh", "Did you mean 'bash'?"),
     ],
 )
@@ -438,3 +444,21 @@ def test_no_color_and_dumb_terminals_are_heeded():
     assert "\x1b[1;31mgreybox:\x1b[0m stopped" in on_a_terminal(code)
     # an empty variable asks for nothing
     assert "\x1b[1;31m" in on_a_terminal(code, NO_COLOR="")
+
+
+def test_an_ending_makes_no_names_alike(tmp_path):
+    for name in ("fleet.csv", "wed.csv", "monday run.csv"):
+        (tmp_path / name).touch()
+    assert nearest_file(tmp_path / "nofile.csv") == ""
+    assert nearest_file(tmp_path / "nope.csv") == ""
+    assert nearest_file(tmp_path / "monday run") == " Did you mean 'monday run.csv'?"
+    assert nearest_file(tmp_path / "wedd.csv") == " Did you mean 'wed.csv'?"
+
+
+def test_the_help_of_import_shows_a_vessel_file(capsys, tmp_path):
+    with pytest.raises(SystemExit):
+        main(["import", "--help"])
+    shown = re.sub("\x1b[^m]*m", "", capsys.readouterr().out)
+    path = tmp_path / "ship.toml"
+    path.write_text(textwrap.dedent(shown[shown.index('  name = "') :]))
+    assert load_vessel(path).commands == ("n", "delta")

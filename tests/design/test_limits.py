@@ -186,7 +186,7 @@ def test_holds_that_cannot_be():
         make_schedule(ship, 100.0, 2.5, 1.0)
     with pytest.raises(UsageError, match="a trial of 15 s has no change of command"):
         make_schedule(ship, 15.0, 10.0, 1.0)
-    with pytest.raises(VesselError, match="'n1' has no limits"):
+    with pytest.raises(VesselError, match=r"'n1', 'alpha1', .* have no limits.*angle_limits"):
         make_schedule(load_vessel("ferry"), 100.0, 10.0, 1.0)
     first, second = ship.thrusters
     apart = replace(second, speed_limits=Limits(25.0, 30.0))

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
+from greybox.errors import LogError
 from greybox.study.blind import draw
+from greybox.vessel.toml import load_vessel
 
 QUICK = DiagnosisOptions(causes=["current"])
 
@@ -27,6 +29,13 @@ def test_the_model_of_these_logs_has_nothing_wrong(sailed) -> None:
     assert found.verdict == "none"
     assert found.model.theta.tolist() == model.theta.tolist()
     assert any("'before' is the model as it was given" in n for n in found.notes)
+
+
+def test_a_model_of_another_ship_is_refused(sailed) -> None:
+    trial, model = sailed
+    other = replace(model, vessel=load_vessel("ferry"))
+    with pytest.raises(LogError, match=r"has no 'n3', .* the model's ship, 'Ferry': give a model"):
+        diagnose([trial.estimation], model=other)
 
 
 def test_coefficients_that_do_not_hold_here_are_wrong(sailed) -> None:

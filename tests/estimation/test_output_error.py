@@ -12,7 +12,7 @@ from virtual import virtual_log, write_csv
 from greybox.commands.main import main
 from greybox.errors import ExcitationError, StructureError, UsageError
 from greybox.estimation import free_run, free_run_noise, output_error
-from greybox.estimation.efficiency_bounds import cramer_rao, information, noise_variances
+from greybox.estimation.efficiency_bounds import _limit, cramer_rao, information, noise_variances
 from greybox.estimation.free_run import _follows, fit_free_runs
 from greybox.estimation.free_run_errors import (
     flat_top_autocovariance,
@@ -943,3 +943,11 @@ def test_a_free_run_in_a_current_has_a_column_for_what_is_zero_without_one():
     old, new = plain.evaluate(*point), wider.evaluate(*point)
     kept = [i for i, c in enumerate(wider.columns) if c.name not in ("X_r*vc", "Y_r*uc")]
     np.testing.assert_array_equal(new[kept], old)
+
+
+def test_a_parameter_at_its_bound_takes_no_part_in_the_efficiency():
+    information = np.array([[4.0, 1.0], [1.0, 2.0]])
+    found = _limit(["Yv", "Nr"], np.linalg.inv(information), np.diag([0.0, 1.0]))
+    assert found.std == pytest.approx({"Nr": 2**-0.5})
+    assert found.determinant == pytest.approx(0.5)
+    assert "inf" not in found.sentence

@@ -77,6 +77,8 @@ def test_wrong_use_in_code(model, tmp_path):
         export_model(model, "c", tmp_path / "x.c", heading="mesured")
     with pytest.raises(UsageError, match=r"wind is 'air'. Use earth or relative"):
         export_model(model, "c", tmp_path / "x.c", wind="air")
+    with pytest.raises(UsageError, match=r"name a file that ends in .c, or export to fmu"):
+        export_model(model, "c", tmp_path / "x.fmu")
     assert gb.export_model is export_model
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from virtual import virtual_log, write_csv
 
 from greybox.commands.main import main
 from greybox.errors import LogError, VesselError
+from greybox.fleet.differing import least_deviation
 from greybox.fleet.ships import find_ships
 from greybox.fleet.trend import fit_trend
 from greybox.vessel.toml import example_vessel
@@ -88,6 +90,21 @@ def test_the_verdict_names_ship_and_coefficient():
         "none of 6 ships differs from the others beyond chance; no coefficient of the 6 ships "
         "followed in time changes"
     )
+
+
+def test_cautions_say_how_far_the_numbers_reach():
+    (reach,) = planted().cautions
+    assert "among 6 ships one coefficient must deviate by about 14 standard deviations" in reach
+    # as the manual has it
+    known = [least_deviation(units, 18) for units in (5, 10, 20)]
+    np.testing.assert_allclose(known, [22, 7, 5], rtol=0.06)
+    found = planted(3, 2)
+    lost = replace(found.ships[0], fit={"u": -np.inf, "v": 3.0, "r": 4.0})
+    fleet = replace(found, ships=(lost, *found.ships[1:]))
+    assert fleet.cautions[0].startswith("the free run of 'ship 1' fits its own logs no better")
+    assert fleet.cautions[1].startswith("each of 'ship 1', 'ship 2', 'ship 3' has fewer than 4 l")
+    assert f"caution: {fleet.cautions[0]}." in fleet.summary()
+    assert "u diverged, v 3 %" in fleet.summary()
 
 
 def test_json_and_table_hold_every_coefficient_of_every_ship():

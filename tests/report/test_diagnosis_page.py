@@ -450,3 +450,12 @@ def test_in_a_browser(tmp_path, pages, verdict):
     path = tmp_path / "page.html"
     write_page(pages[verdict], path)
     require_legible(path, 390)
+
+
+def test_many_causes_stand_by_their_titles_on_the_first_screen():
+    one = diagnosis_of("named").causes[0]
+    many = replace(diagnosis_of("partly"), causes=(one,) * 4)
+    headline = diagnosis_page(many, RECORD).headline
+    assert headline.startswith(f"4 causes stand: {one.title}; ")
+    assert headline.endswith("They do not explain all of it.")
+    assert one.evidence not in headline

@@ -415,6 +415,22 @@ def test_other_angles_have_no_limit():
     assert "no IMO limit for a 20/5 zig-zag" in z.summary()
 
 
+def test_the_heading_that_was_ordered_is_judged(zigzag_run):
+    run, executes, stop = zigzag_run
+    # a quick ship passes it between samples
+    late = {
+        "executes": np.add(executes, [0.0, 4.0, 0.0, 4.0]).tolist(),
+        "rudder": 20 * DEG,
+        "length": LENGTH,
+        "stop": stop,
+    }
+    at = [run[n] for n in ("t", "x_n", "y_n", "psi", "u", "v")]
+    assert measure_zigzag(*at, **late).criteria[0].limit is None
+    found = measure_zigzag(*at, **late, heading=-20 * DEG)
+    assert found.heading == 20 * DEG
+    assert found.criteria[0].limit == pytest.approx(25 * DEG)
+
+
 def test_ten_ten_is_judged(zigzag_run):
     order, _ = zigzag_helm(10 * DEG, 10 * DEG, 60.0)
     run = sampled(nomoto(order, 420), 0.5)

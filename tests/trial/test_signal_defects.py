@@ -15,7 +15,7 @@ from greybox.trial.checks.check import check_recording
 from greybox.trial.checks.heading_wrap import wrap_findings
 from greybox.trial.checks.position_hold import hold_findings
 from greybox.trial.checks.position_jump import jump_findings
-from greybox.trial.checks.signal_quality import coarse_findings
+from greybox.trial.checks.signal_quality import coarse_findings, spike_findings
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs
@@ -487,3 +487,16 @@ def test_the_antenna_of_the_drone_leaps_aside_for_three_seconds(data_folder):
     jumps = [f for f in report.findings if f.id == "position_jump"]
     assert [round(f.value[1], 1) for f in jumps] == [-0.3, 0.3]
     assert times(jumps[1])[0] - times(jumps[0])[0] == pytest.approx(3.0, abs=0.3)
+
+
+def test_a_speed_over_ground_that_leaps_is_no_jump_of_the_position(ship):
+    d = copied(5, 1.0)
+    t = d["t"]
+    east, north = (np.gradient(d[n], t) for n in ("y_n", "x_n"))
+    sog, cog = np.hypot(north, east), np.arctan2(east, north)
+    k = len(t) // 2
+    sog[k] *= 6
+    d |= {"v_n": sog * np.cos(cog), "v_e": sog * np.sin(cog)}
+    found = [f for f in spike_findings(as_recording(d)) if f.channel in ("v_n", "v_e")]
+    assert found
+    assert all(f.repair[0].channels == ("v_n", "v_e") for f in found)

@@ -39,6 +39,8 @@ _MATERIAL = {
 }  # fmt: skip
 # steps of rounded values that matter, as a share of the signal's spread
 _COARSE = 0.004
+# components of what one fix of a receiver tells, speed and course
+_FIX = ("v_n", "v_e")
 # a sensor that is stuck repeats itself this long
 STUCK_SECONDS = 3.0
 STUCK_SAMPLES = 8
@@ -207,12 +209,20 @@ def spike_findings(recording: Recording) -> list[Finding]:
                 "leave those samples out (import --fix does; what is missing is bridged where "
                 "one sample is, else a gap)",
                 (s.name,),
-                (mend("drop", (s.name,), times=tuple(float(x) for x in t[spikes])),),
+                (mend("drop", _measured_with(s, recording), times=tuple(map(float, t[spikes]))),),
                 True,
                 {"t": t, "value": value, "spikes": spikes, "worst": int(worst), "distance": gap},
             )
         )
     return found
+
+
+def _measured_with(s: Signal, recording: Recording) -> tuple[str, ...]:
+    """Return a signal, and the other component of its fix, which is as wrong."""
+    if s.name not in _FIX or any(n not in recording for n in _FIX):
+        return (s.name,)
+    one, two = (recording[n] for n in _FIX)
+    return _FIX if np.array_equal(one.t, two.t) else (s.name,)
 
 
 def _worth(name: str, value: Array) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -227,7 +228,8 @@ def table_columns(
     # what the vessel file maps itself is not made of the same columns once more
     assigned = {n: a for n, a in assigned.items() if not own & set(parts.get(a.raw, ()))}
     if "t" not in assigned:
-        advice = "Map" if guess else "Make a log of the file with greybox import, or map"
+        making = f"greybox import {shlex.quote(table.path.name)} --vessel V --out log.csv"
+        advice = "Map" if guess else f"Make a log of it with {making}, or map"
         timed = (c for c in table.columns if c in table.dates | table.clocks or "time" in c.lower())
         likely = next(timed, "tvec")
         raise LogError(

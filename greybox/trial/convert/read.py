@@ -7,6 +7,7 @@ recorded, guesses nothing, and refuses what would have to be mended.
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -130,7 +131,8 @@ def read_segments(
     if isinstance(table, Recording):
         raise LogError(
             f"'{path.name}' is a raw file ({table.files[0].format if table.files else 'raw'}): "
-            f"make a log of it first with greybox import {path.name} --vessel V --out LOG.csv."
+            f"make a log of it first with greybox import {shlex.quote(path.name)} --vessel V "
+            f"--out log.csv."
         )
     known, vessel = written_log(path, vessel)
     known = known or Provenance(path.name)
@@ -376,7 +378,8 @@ def _require(
         if column not in channels:
             raise LogError(
                 f"'{name}' has no column '{column}', which moves a thruster of "
-                f"'{vessel.name}'.{suggestion(column, free)} Its columns: "
+                f"'{vessel.name}'.{suggestion(column, free)} Give the vessel file, or the model, "
+                f"of the ship that sailed it, or name the right one of its columns there: "
                 f"{', '.join(columns[:30])}."
             )
     for state in states:

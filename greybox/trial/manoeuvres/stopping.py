@@ -160,7 +160,9 @@ def measure_stopping(
     stop = float(t[-1]) if stop is None else stop
     notes = []
     if not approach.seen:
-        notes.append("the log starts with the stop: heading and speed before it are its first ones")
+        notes.append(
+            "no straight approach before the stop: heading and speed are those at its start"
+        )
     if track.integrated:
         notes.append("positions are integrated from u, v and heading, none were measured")
     psi0 = approach.heading

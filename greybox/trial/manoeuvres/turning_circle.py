@@ -227,7 +227,9 @@ def measure_turning_circle(
     turned = direction * turned
     notes = []
     if not approach.seen:
-        notes.append("the log starts with the turn: heading and speed before it are its first ones")
+        notes.append(
+            "no straight approach before the turn: heading and speed are those at its start"
+        )
     if track.integrated:
         notes.append("positions are integrated from u, v and heading, none were measured")
 

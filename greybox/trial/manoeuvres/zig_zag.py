@@ -141,6 +141,7 @@ def measure_zigzag(
     executes: Sequence[float],
     rudder: float,
     length: float,
+    heading: float | None = None,
     stop: float | None = None,
     scale: float = 1.0,
     heading_std: float | None = None,
@@ -166,6 +167,9 @@ def measure_zigzag(
         Rudder angle [rad], any sign.
     length : float
         Of the ship [m].
+    heading : float, optional
+        Change of heading at which the rudder was to be reversed [rad], any sign; that of the
+        executes otherwise, which a quick ship may pass before the next sample.
     stop : float, optional
         When the last rudder angle ended [s]; the end of the log by default.
     scale : float
@@ -195,7 +199,7 @@ def measure_zigzag(
     notes = []
     if not approach.seen:
         notes.append(
-            "the log starts with the zig-zag: heading and speed before it are its first ones"
+            "no straight approach before the zig-zag: heading and speed are those at its start"
         )
     if track.integrated:
         notes.append("positions are integrated from u, v and heading, none were measured")
@@ -243,7 +247,8 @@ def measure_zigzag(
         checks.append(Quantity(when - time, slow, "s", fit.dof))
 
     nominal = _nominal_rudder(rudder)
-    heading = _nominal_heading([q.value for q in switch])
+    reached = _nominal_heading([q.value for q in switch])
+    heading = reached if heading is None else abs(heading)
     own = direction * (psi - psi0.value)
     quarter = ends[0] - start
     angle = min(_TEN, heading)

@@ -10,7 +10,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
 
-from greybox.errors import LogError, suggestion
+from greybox.errors import LogError
+from greybox.files import nearest_file
 from greybox.registry import entry_points
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.table import TableFile
@@ -121,14 +122,11 @@ def _reader(kind: str, path: Path) -> Callable[..., Any]:
 def _kind(path: Path) -> str:
     try:
         there = path.exists()
-        beside = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise LogError(f"cannot read '{str(path)[:80]}': {reason}. Name an existing log.") from None
     if not there:
-        raise LogError(
-            f"there is no file '{path}'.{suggestion(path.name, beside)} Name an existing log."
-        )
+        raise LogError(f"there is no file '{path}'.{nearest_file(path)} Name an existing log.")
     if path.is_dir():
         if (path / "metadata.yaml").exists():
             return "ros"
