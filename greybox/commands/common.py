@@ -24,6 +24,8 @@ __all__ = [
     "count", "positive", "progress", "provenance", "publish", "read_logs", "say",
 ]  # fmt: skip
 
+# endings of what is no model
+_NO_MODELS = (".csv", ".parquet", ".pq", ".toml", ".html")
 # GiB that logs and what is made of them may take by default, those of a usual machine
 _MEMORY = 4.0
 VESSEL_HELP = "vessel file (TOML), as 'greybox import --help' shows one, or thesis or ferry"
@@ -176,6 +178,22 @@ def read_logs(
         return logs, (*misnamed, *told)
     logs, left_out = decimate_segments(logs, sample_time)
     return logs, (*misnamed, *told, *left_out)
+
+
+def require_model_name(path: str | None) -> None:
+    """Raise where a model would be written under the ending of another file.
+
+    Raises
+    ------
+    UsageError
+        Commands that look for logs or vessel files would take it for one.
+    """
+    from greybox.errors import UsageError
+
+    if path is not None and Path(path).suffix.casefold() in _NO_MODELS:
+        raise UsageError(
+            f"--out names '{path}', and a model is JSON: name a file that ends in .json."
+        )
 
 
 # options that name files to read, and to write

@@ -15,6 +15,7 @@ from greybox.commands.common import (
     provenance,
     publish,
     read_logs,
+    require_model_name,
 )
 from greybox.public import one_thread
 
@@ -109,6 +110,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.vessel.force import force_inputs
     from greybox.vessel.toml import load_vessel
 
+    require_model_name(options.out)
     check_targets(options.out, options.json, options.report)
     keep_freed_memory()
     vessel = load_vessel(options.vessel)

@@ -170,7 +170,9 @@ def _chosen(ids: Sequence[str] | None) -> dict[str, Cause]:
     for name in ids or ():
         if name not in known:
             raise UsageError(
-                f"there is no cause '{name}'.{suggestion(name, known)} Known: {', '.join(known)}."
+                f"there is no cause '{name}'"
+                f"{': write causes apart, with spaces' if ',' in name else ''}."
+                f"{suggestion(name, known)} Known: {', '.join(known)}."
             )
     return {k: c for k, c in known.items() if ids is None or k in ids}
 

@@ -144,7 +144,9 @@ def compare_units(estimates: Array, covariances: Array) -> tuple[Comparison, ...
 
 
 def least_deviation(units: int, size: int) -> float:
-    """Return by how many standard deviations one coefficient must deviate to be named.
+    """Return by how much one coefficient must deviate to be named.
+
+    In standard deviations of what the other units predict, by Student's t.
 
     Parameters
     ----------
@@ -152,7 +154,7 @@ def least_deviation(units: int, size: int) -> float:
         Units that are compared, and coefficients of each; the errors of the estimates are small.
     """
     alone = SIGNIFICANCE / (2 * size * units)
-    return float(t.isf(alone / 2, units - 2) * np.sqrt(1 + 1 / (units - 1)))
+    return float(t.isf(alone / 2, units - 2))
 
 
 def _against_others(

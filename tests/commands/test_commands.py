@@ -294,3 +294,11 @@ def test_an_error_about_a_raw_file_tells_the_whole_command(tmp_path, capsys, mon
     assert run("estimate", "my raw.csv", "--vessel", "thesis") == 1
     told = capsys.readouterr().err
     assert "greybox import 'my raw.csv' --vessel thesis --out log.csv" in told
+
+
+@pytest.mark.parametrize("command", ["estimate", "diagnose"])
+def test_a_model_is_not_written_under_the_ending_of_a_log(command, tmp_path, capsys):
+    out = tmp_path / "model.csv"
+    assert run(command, "none.csv", "--vessel", "thesis", "--out", out) == 1
+    assert "a model is JSON: name a file that ends in .json" in capsys.readouterr().err
+    assert not out.exists()

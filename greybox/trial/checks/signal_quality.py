@@ -205,7 +205,7 @@ def spike_findings(recording: Recording) -> list[Finding]:
                 f"{len(spikes)} sample{'s' if len(spikes) > 1 else ''} of {s.name} "
                 f"{'stand out from their' if len(spikes) > 1 else 'stands out from its'} "
                 f"neighbours, the largest by {size:.3g} {s.unit} at t = {t[worst]:.6g} s, "
-                f"where the neighbours scatter by {scale:.2g}",
+                f"where the neighbours scatter by {scale:.2g} {s.unit}".rstrip(),
                 "leave those samples out (import --fix does; what is missing is bridged where "
                 "one sample is, else a gap)",
                 (s.name,),
