@@ -113,6 +113,8 @@ def rule(
             f"held-out runs by {100 * taken:.0f} %"
         )
     named = tuple(c for c in stand if not _grouped(c, groups))
+    # one that makes held-out runs worse does not help
+    leaning = tuple(c for c in leaning if c.proof.gain > 0)
     if named or known:
         verdict = DiagnosisVerdict.PARTLY if why else DiagnosisVerdict.NAMED
     elif groups:
@@ -120,7 +122,7 @@ def rule(
     else:
         verdict = DiagnosisVerdict.UNEXPLAINED if why else DiagnosisVerdict.NONE
     return Ruling(
-        verdict, named, tuple(leaning), _remaining(final, pairs, left, why),
+        verdict, named, leaning, _remaining(final, pairs, left, why),
         _next(verdict, groups), first, left, final, tuple(notes),
     )  # fmt: skip
 

@@ -69,8 +69,10 @@ class Standing:
         """Whether the cause explains what no generic force explains as well."""
         gains = self.beyond.gain > 0 and self.beyond.p_value < self.level
         own = self.share is not None and self.share >= OWN_SHARE and self.half < self.level
-        # that a run leaves every bound without it tells nothing of a cause's size
-        sure = self.told < (SAME if np.isfinite(self.beyond.gain) else PROVEN)
+        # what heading, time or earlier commands do has no share of such a force to show for it, and
+        # that a run leaves every bound without a cause tells nothing of its size
+        alike = self.share is not None and np.isfinite(self.beyond.gain)
+        sure = self.told < (SAME if alike else PROVEN)
         return (gains or own) and self.clear < PROVEN and sure
 
 
