@@ -235,8 +235,8 @@ def _column(raw: str, table: ColumnTable, vessel: Vessel) -> ColumnMapping:
     if table.name not in known:
         raise VesselError(
             f"column '{raw}' is mapped to '{table.name}', which is neither a channel nor a "
-            f"thruster column.{suggestion(table.name, known)} Name one of them, or let a "
-            f"[[thruster]] name '{table.name}' as its speed, angle or rudder: {', '.join(known)}."
+            f"thruster column.{suggestion(table.name, known)} Name a channel, such as psi or u, or "
+            f"write that name as the speed, angle or rudder of a [[thruster]] too."
         )
     if table.unit is not None:
         try:

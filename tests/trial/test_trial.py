@@ -293,7 +293,7 @@ def test_bad_logs(tmp_path, change, message):
 def test_a_column_that_another_thruster_has_is_no_misspelling(tmp_path):
     thrusters = [{"type": "fixed", "speed": f"speed{k}"} for k in (1, 2)]
     frame = table().rename(columns={"n": "speed1"})
-    with pytest.raises(LogError, match=r"no column 'speed2', which moves a thruster of 'S'\. Its"):
+    with pytest.raises(LogError, match=r"no column 'speed2', which moves a thruster of 'S'\. Give"):
         read(frame, tmp_path, SHIP | {"thruster": thrusters})
     frame["speed_2"] = frame["speed1"]
     with pytest.raises(LogError, match=r"no column 'speed2', .* Did you mean 'speed_2'\?"):
