@@ -207,7 +207,7 @@ def test_causes_that_cannot_be_at_work_are_named(model) -> None:
 
 @pytest.fixture(scope="module")
 def found(model):
-    request = request_of(effort=0.3)
+    request = request_of(effort=0.6)
     return design_for_causes(
         request, model, AskedCauses({"heading_bias": BIAS, "current": CURRENT})
     )
