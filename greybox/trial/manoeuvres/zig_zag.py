@@ -248,7 +248,7 @@ def measure_zigzag(
 
     nominal = _nominal_rudder(rudder)
     reached = _nominal_heading([q.value for q in switch])
-    heading = reached if heading is None else abs(heading)
+    heading = reached if heading is None else _round(abs(heading), _HEADING_NEAR)
     own = direction * (psi - psi0.value)
     quarter = ends[0] - start
     angle = min(_TEN, heading)
