@@ -182,7 +182,9 @@ def _with_files(steps: Sequence[str], record: Mapping[str, Any]) -> list[str]:
         for step in steps
     ]
     if not out and any("MODEL" in step for step in steps):
-        filled.insert(0, f"write the models to files: {record['line']} --out {model}")
+        filled.insert(
+            0, f"write the models to files: the same command with --out {quote(str(model))}"
+        )
     return filled
 
 

@@ -10,6 +10,7 @@ import pytest
 from greybox.diagnosis.budget import MOTION, REST, SENSOR, SwitchedOff, error_budget, errors_without
 from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.evidence.held_out import Pair
+from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.preparing import prepare
 from greybox.study.blind import draw
 
@@ -140,6 +141,13 @@ def test_nothing_changes_where_nothing_is_switched_off(pair: Pair) -> None:
     errors = errors_without([pair], pair.fit, lambda _, point: point, lambda _: {})
     own = pair.held_fit.errors[0][:, :3]
     assert (errors**2).sum(axis=0) == pytest.approx((own**2).sum(axis=0), rel=0.02)
+
+
+def test_coefficients_are_kept_where_no_fit_predicts_within_bounds(pair: Pair, monkeypatch) -> None:
+    monkeypatch.setattr(Problem, "settle", lambda self, fit, *_: replace(fit, cost=np.inf))
+    errors = errors_without([pair], pair.fit, lambda _, point: point, lambda _: {})
+    own = states_of(pair)
+    assert (errors**2).sum(axis=0) == pytest.approx((own**2).sum(axis=0), rel=0.1)
 
 
 @pytest.mark.long

@@ -36,6 +36,11 @@ def test_the_wind_is_found_in_a_tankers_trials(data_folder: Path, tmp_path: Path
     found = json.loads(result.read_text())
     # two missing samples of a position cut no run
     assert "turn_14-Sep-2020_14_16_04," in found["validated_on"]
+    # what makes held-out runs worse is not told as a help
+    helped = [c["held_out_gain"]["value"] for c in found["partial"]]
+    assert all(value is None or value > 0 for value in helped)
+    # a pond has no current
+    assert "current" not in {c["id"] for c in found["causes"]}
     # what the wind leaves decides whether it stands alone or only helps
     (wind,) = (c for c in (*found["causes"], *found["partial"]) if c["id"] == "wind")
     # a force against the velocity through the air in surge and sway

@@ -41,6 +41,9 @@ def proof(gain: float, p: float) -> Proof:
         # it moves by less than it is, or by more
         ((50.0, 1e-9), 0.9, 1e-4, 1e-9, 0.1, True),
         ((50.0, 1e-9), 0.9, 1e-4, 1e-9, 0.4, False),
+        # what heading, time or earlier commands do must be surer
+        ((50.0, 1e-9), None, 1.0, 1e-9, 0.04, True),
+        ((50.0, 1e-9), None, 1.0, 1e-9, 0.1, False),
         # where it holds the run within bounds, nothing else speaks for it
         ((np.inf, 0.0), None, 1.0, 1e-9, 0.01, True),
         ((np.inf, 0.0), None, 1.0, 1e-9, 0.1, False),

@@ -120,6 +120,8 @@ def test_comparison_tells_models_apart(thesis_model, clean_log, noisy_log):
     )
     json.dumps(c.to_dict())
     assert "fit u [%]" in c.summary()
+    assert "rmse u [m/s]" in c.summary()
+    assert "rmse r [rad/s]" in c.summary()
 
 
 def test_only_tables_are_kept_of_logs_that_are_not_drawn(thesis_model, noisy_log):
