@@ -293,7 +293,7 @@ class FeedbackSampling(Cause):
 
     id = "feedback_sampling"
     kind = "thruster"
-    title = "feedback that is not held"
+    title = "commands that move between their samples"
     signature = "the motion comes half a sample before what held commands make of it"
     extension = 'commands that move on straight lines between samples (between = "interpolated")'
     reference = "Ljung (1999), section 13.3"
