@@ -207,7 +207,8 @@ def search(
     """Look for causes until held-out logs confirm no further one.
 
     One that is not alone, after which the terms that the data choose may go on, looks for what
-    past commands do only, once forces of motion and commands are left that a cause did not take.
+    past commands do only, once forces of motion and commands are left that neither a cause takes
+    nor two of them.
 
     Parameters
     ----------
@@ -242,19 +243,46 @@ def search(
         if step.taken is None:
             break
         left = not alone and _left_to_motion(case, fit)
-        fit, causes = step.taken.fit, [*causes, step.taken]
-        if case.metric == "coloured":
-            # those beside chosen terms are weighed at the end
-            fit, causes = _backward(case, fit, causes, len(hypotheses))
-        # what a better noise would gain must not count for the next cause
-        fit = case.problem(fit.integrator).settle(fit, SETTLE)
+        fit, causes = _with(case, causes, step.taken, len(hypotheses))
         if left and _left_to_motion(case, fit):
-            _log.info("forces of motion and commands are left that one cause does not take")
+            more = _completed(case, fit, causes, hypotheses)
+            if more is not None:
+                second, fit, causes = more
+                steps.append(second)
+                continue
+            _log.info("forces of motion and commands are left that one or two causes do not take")
             # those have no past
             hypotheses = [h for h in hypotheses if h.past]
             if not hypotheses:
                 break
     return Search(base, fit, tuple(steps), tuple(causes), len(hypotheses))
+
+
+def _with(
+    case: DiagnosisProblem, causes: Sequence[Candidate], taken: Candidate, tried: int
+) -> tuple[Fit, list[Candidate]]:
+    """Return the fit with a cause that was taken, and all causes that are in force then."""
+    fit, causes = taken.fit, [*causes, taken]
+    if case.metric == "coloured":
+        # those beside chosen terms are weighed at the end
+        fit, causes = _backward(case, fit, causes, tried)
+    # what a better noise would gain must not count for the next cause
+    return case.problem(fit.integrator).settle(fit, SETTLE), causes
+
+
+def _completed(
+    case: DiagnosisProblem,
+    fit: Fit,
+    causes: Sequence[Candidate],
+    hypotheses: Sequence[Hypothesis],
+) -> tuple[Step, Fit, list[Candidate]] | None:
+    """Return the step to a second cause that leaves nothing to motion and commands, if one does."""
+    tried = len(hypotheses)
+    second = take_step(case, fit, causes, [h for h in hypotheses if not h.past], tried)
+    if second.taken is None:
+        return None
+    fit, found = _with(case, causes, second.taken, tried)
+    return None if _left_to_motion(case, fit) else (second, fit, found)
 
 
 def _left_to_motion(case: DiagnosisProblem, fit: Fit) -> bool:
@@ -266,9 +294,16 @@ def _left_to_motion(case: DiagnosisProblem, fit: Fit) -> bool:
 
 
 def take_step(
-    case: DiagnosisProblem, fit: Fit, causes: Sequence[Candidate], hypotheses: Sequence[Hypothesis]
+    case: DiagnosisProblem,
+    fit: Fit,
+    causes: Sequence[Candidate],
+    hypotheses: Sequence[Hypothesis],
+    tried: int = 0,
 ) -> Step:
-    """Score what is left, refit the best, and take the likeliest if it holds."""
+    """Score what is left, refit the best, and take the likeliest if it holds.
+
+    `tried` hypotheses count where more than those given are.
+    """
     left = [a for a in hypotheses if not _taken(a, causes)]
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     near = [a for a in left if not a.refit_from_scratch]
@@ -281,7 +316,7 @@ def take_step(
         fits += [(hypothesis, found, held_out.prove(fit, found)) for hypothesis, found in again]
     candidates = sorted(
         (
-            assess_candidate(proof, fit, found, hypothesis, len(left), problem.names)
+            assess_candidate(proof, fit, found, hypothesis, max(tried, len(left)), problem.names)
             for hypothesis, found, proof in fits
         ),
         key=_bic,

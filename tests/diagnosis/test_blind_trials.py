@@ -118,6 +118,16 @@ def test_two_effects_are_both_named() -> None:
     assert_told_and_gained(right)
 
 
+def test_a_second_force_that_leaves_nothing_is_named_without_other_terms() -> None:
+    pairs = (("current", "thruster_gain"), ("input_delay", "crossflow"))
+    study = run_power(
+        judge_by_diagnosis, effects=pairs, sizes=(1.0,), kinds=("zigzag",), runs=1, none_runs=0,
+        seed=6067,
+    )  # fmt: skip
+    assert [o.answer for o in study.outcomes] == ["right", "right"]
+
+
+@pytest.mark.study
 def test_effects_without_a_name_get_none() -> None:
     outcomes = [
         o for kind, effects in in_turn(UNKNOWN, 1).items()
