@@ -185,12 +185,15 @@ def write(
 
 
 def squares(logs: Sequence[TrialLog]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the squared held-out error of each state of the model without causes."""
+    """Return the squared held-out error of each state of the model without causes.
+
+    Infinite where no run of it stays bounded.
+    """
     ready = prepare(logs[:-HELD_OUT], logs[-HELD_OUT:], None, "thesis", None)
     base = ready.base()
     pairs = ready.case.held_out(base.integrator).pairs(base)
     errors = errors_before(pairs, base, ready.case.first)
-    return np.asarray((errors**2).mean(axis=0))
+    return np.asarray((errors**2).mean(axis=0)) if len(errors) else np.full(3, np.inf)
 
 
 def switches(name: str) -> dict[str, float]:
@@ -221,8 +224,10 @@ def case(name: str, effect: str, seed: int, switches: Sequence[str]) -> dict[str
         if effect != "none":
             again = write(Path(place) / "clean", name, effect, seed, clean=True)
             assert again is not None
-            shares = 1 - squares(again[0]) / squares(logs)
-            moves = _moves(name, effect, seed) >= COUNTS * squares(logs)
+            whole = squares(logs)
+            shares = 1 - squares(again[0]) / whole
+            # what leaves no bounded run counts, whatever it moves
+            moves = (_moves(name, effect, seed) >= COUNTS * whole) | np.isinf(whole)
         begun = time.perf_counter()
         found = diagnose(logs[:-HELD_OUT], validate=logs[-HELD_OUT:]).to_dict()
     held = set().union(*(HOLDS.get(s, set()) for s in switches))
@@ -237,7 +242,7 @@ def case(name: str, effect: str, seed: int, switches: Sequence[str]) -> dict[str
     return {
         "ship": name, "effect": effect, "seed": seed, "share": float(shares.max()),
         "counts": bool((moves & (shares >= COUNTS)).any()),
-        "budget": _budget(found["budget"], planted, shares), "verdict": found["verdict"],
+        "budget": _budget(found["budget"], planted, shares.tolist()), "verdict": found["verdict"],
         "causes": ids, "groups": groups,
         "partial": [c["id"] for c in found["partial"]],
         "stands": bool(true & {*ids, *(c for g in groups for c in g)}),
