@@ -297,18 +297,12 @@ def hasty(monkeypatch):
     monkeypatch.setattr(design, "_POLISH", 2)
 
 
-# ways of which CI tries every option; the others take minutes each
-IN_CI = ("coefficients", "prediction")
-
-
 def test_every_option_has_a_value_to_try():
     assert set(VALUES) | set(UNCHANGED) == set(options_of_design())
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "way", [pytest.param(w, marks=() if w in IN_CI else pytest.mark.study) for w in WAYS]
-)
+@pytest.mark.parametrize("way", WAYS)
 def test_every_option_is_honoured_or_refused(hasty, design, way):
     """In each way of designing it changes PLAN or JSON, or whether there is one, or is refused."""
     usual = {}

@@ -99,7 +99,6 @@ def test_the_commands_it_shows_work(demo, monkeypatch, capsys):
 
 
 @pytest.mark.long
-@pytest.mark.study
 def test_other_effects_are_named_too(tmp_path, monkeypatch):
     monkeypatch.setattr("experiment_design.demo.loop._EFFORT", 0.02)
     for effect in ("current", "quadratic_thrust"):
