@@ -235,20 +235,17 @@ def search(
         known.add(frozenset(c.hypothesis.key for c in causes))
         step = take_step(case, fit, causes, hypotheses)
         steps.append(step)
-        progress(f"step {len(steps)}: {len(step.scores)} causes scored")
-        _log.info(
-            "step %d: %d causes scored, %s", len(steps), len(step.scores),
-            "none holds" if step.taken is None else f"{step.taken.hypothesis.cause} holds",
-        )  # fmt: skip
+        _told(steps, progress)
         if step.taken is None:
             break
         left = not alone and _left_to_motion(case, fit)
         fit, causes = _with(case, causes, step.taken, len(hypotheses))
         if left and _left_to_motion(case, fit):
-            more = _completed(case, fit, causes, hypotheses)
+            more = _completed(case, fit, causes, hypotheses) if len(causes) < most else None
             if more is not None:
                 second, fit, causes = more
                 steps.append(second)
+                _told(steps, progress)
                 continue
             _log.info("forces of motion and commands are left that one or two causes do not take")
             # those have no past
@@ -256,6 +253,16 @@ def search(
             if not hypotheses:
                 break
     return Search(base, fit, tuple(steps), tuple(causes), len(hypotheses))
+
+
+def _told(steps: Sequence[Step], progress: Callable[[str], None]) -> None:
+    """Say what the last step found."""
+    step = steps[-1]
+    progress(f"step {len(steps)}: {len(step.scores)} causes scored")
+    _log.info(
+        "step %d: %d causes scored, %s", len(steps), len(step.scores),
+        "none holds" if step.taken is None else f"{step.taken.hypothesis.cause} holds",
+    )  # fmt: skip
 
 
 def _with(

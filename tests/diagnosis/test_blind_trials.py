@@ -127,7 +127,6 @@ def test_a_second_force_that_leaves_nothing_is_named_without_other_terms() -> No
     assert [o.answer for o in study.outcomes] == ["right", "right"]
 
 
-@pytest.mark.study
 def test_effects_without_a_name_get_none() -> None:
     outcomes = [
         o for kind, effects in in_turn(UNKNOWN, 1).items()
