@@ -49,11 +49,16 @@ from greybox.diagnosis.waves import Waves
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
 from greybox.numerics.parallel import map_forked
+from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
 from greybox.trial.validity import ranges
+from greybox.validation.bands import LEVEL, predict_bands
 from greybox.validation.fit import LogFit, fit_on
 
 Array = NDArray[np.float64]
+
+# models drawn from the covariance of the extended one, to see whether they stay bounded
+_DRAWS = 64
 
 
 class DiagnosisBuilder:
@@ -128,7 +133,8 @@ class DiagnosisBuilder:
             over_chosen = self.gain(chosen, after, validate, final, found.chosen)[0]
         members = [c for pair in groups for c in pair]
         alternatives = {c.hypothesis.id: self.model(c.fit, self.record((c,))) for c in members}
-        notes = [*self._notes(after), *ruling.notes]
+        told = after if final is found.final else before
+        notes = [*self._notes(after), *ruling.notes, *diverging(told, validate or case.logs)]
         return Diagnosis(
             verdict=ruling.verdict,
             causes=(*known, *(self.cause(c, final) for c in ruling.named)),
@@ -322,6 +328,33 @@ class DiagnosisBuilder:
         for change in after.changes:
             out.append(f"the extended model tells the log's own clock: {change.sentence}.")
         return out
+
+
+def diverging(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> list[str]:
+    """Say how many models drawn from a model's covariance diverge, where they are many.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+    logs : sequence of TrialLog
+        The longest is run.
+
+    Returns
+    -------
+    list of str
+        One sentence, or none where the draws that diverge are fewer than those that 95 %
+        limits leave out.
+    """
+    longest = correct_log(max(logs, key=len), model.vessel)
+    bands = predict_bands(model, longest, runs=_DRAWS)
+    if bands.diverged <= (1 - LEVEL) * bands.runs:
+        return []
+    return [
+        f"of {bands.runs} models drawn from the covariance of the model that --out writes, "
+        f"{bands.diverged} diverge on {longest.name}: its coefficients are too uncertain for the "
+        f"intervals of greybox predict and simulate. Diagnose longer logs, or begin from a "
+        f"smaller --structure."
+    ]
 
 
 def _leave_out(hypothesis: Hypothesis, problem: Problem, point: Point) -> Point:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from schemas import schema
 
 from greybox.commands.main import main
+from greybox.diagnosis.builder import diverging
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.gain import gains, run_on
 from greybox.errors import LogError, UsageError
@@ -112,3 +115,17 @@ def test_gain_of_a_model_on_itself_is_nothing() -> None:
     for gain in gains([run], [run], 1.0, 0).values():
         assert gain.before == gain.after
         assert gain.ci == (0.0, 0.0)
+
+
+def test_a_covariance_whose_models_diverge_is_told() -> None:
+    trial = _draw(1, kind="pulses", samples=200)
+    sure = ManoeuvringModel(
+        get_structure("thesis"), np.array([TRUE[n] for n in get_structure("thesis").parameters]),
+        1e-8 * np.eye(18), 1.0, trial.vessel,
+    )  # fmt: skip
+    assert diverging(sure, [trial.estimation, trial.validation]) == []
+    (told,) = diverging(replace(sure, covariance=np.eye(18)), [trial.validation])
+    count = re.search(r"of 64 models drawn .*, (\d+) diverge on", told)
+    assert count is not None
+    # standard errors of one are far above the coefficients themselves
+    assert int(count[1]) > 32
