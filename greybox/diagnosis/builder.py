@@ -42,7 +42,7 @@ from greybox.diagnosis.result import (
     finite,
 )
 from greybox.diagnosis.ruling import rule
-from greybox.diagnosis.search import Candidate, Search, backwards, instead
+from greybox.diagnosis.search import Candidate, Search, Step, backwards, instead
 from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.symptoms import find_symptoms
 from greybox.diagnosis.waves import Waves
@@ -218,27 +218,31 @@ class DiagnosisBuilder:
         }
 
     def _groups(self) -> list[list[Candidate]]:
-        out = []
-        causes = self.found.causes
+        asked = [
+            step for step in self.found.steps
+            if step.taken is not None
+            and any(c.hypothesis.key == step.taken.hypothesis.key for c in self.found.causes)
+        ]  # fmt: skip
+        self.case.held_out(self.found.final.integrator).contributions(self.found.final)
+        # candidates hold functions, which no other process can send: the few groups are made here
+        many = map_forked(lambda step: len(self._group(step)) > 1, asked)
+        return [self._group(step) for step, several in zip(asked, many, strict=True) if several]
+
+    def _group(self, step: Step) -> list[Candidate]:
+        """Return the cause that a step took, and the candidates that do as well in its place."""
+        causes, key = self.found.causes, step.taken.hypothesis.key if step.taken else ""
         ids = {c.hypothesis.cause for c in causes}
-        for step in self.found.steps:
-            if step.taken is None or not any(
-                c.hypothesis.key == step.taken.hypothesis.key for c in causes
-            ):
-                continue
-            best = next(c for c in step.candidates if c.hypothesis.key == step.taken.hypothesis.key)
-            others = [c for c in step.candidates if c.hypothesis.cause not in ids]
-            without = step.before
-            if len(causes) > 1 or self.found.leaning:
-                without, best, others = instead(self.case, self.found.final, best, others)
-            like = rivals(self.case.problem, self.case.held_out, best, others)
-            like = [
-                c for c in like
-                if not denied(c.hypothesis.key, self.agreeing) and self._stands(c, without)
-            ]  # fmt: skip
-            if like:
-                out.append([best, *like])
-        return out
+        best = next(c for c in step.candidates if c.hypothesis.key == key)
+        others = [c for c in step.candidates if c.hypothesis.cause not in ids]
+        without = step.before
+        if len(causes) > 1 or self.found.leaning:
+            without, best, others = instead(self.case, self.found.final, best, others)
+        like = rivals(self.case.problem, self.case.held_out, best, others)
+        like = [
+            c for c in like
+            if not denied(c.hypothesis.key, self.agreeing) and self._stands(c, without)
+        ]  # fmt: skip
+        return [best, *like]
 
     def _stands(self, rival: Candidate, without: Fit) -> bool:
         """Whether a rival, too, does more than a generic force."""

@@ -27,6 +27,9 @@ _ENOUGH = 0.02
 _MOST = 25
 # a point that −2 log L tells from another by less than this has its derivatives
 _NEAR = 1.0
+# a fall of −2 log L that differs from what its step promised by less than this share shows that
+# the derivatives of the last step serve the next one, too
+_AS_PROMISED = 0.2
 _DAMPING_LIMIT = 1e6
 # mean square of a log's errors, in that of all logs, that has a logarithm
 _LEAST_SIZE = 1e-12
@@ -286,12 +289,12 @@ class Problem:
             if not np.isfinite(normal.matrix).all():
                 break
             gradient = normal.gradient(nu)
-            accepted = False
+            accepted, fresh = False, normal.near(vector)
             while damping <= _DAMPING_LIMIT:
                 step = bounded_step(normal.matrix, gradient, low - vector, high - vector, damping)
                 promise = float(2 * gradient @ step - step @ normal.matrix @ step)
                 if promise < _ENOUGH and damping < 1:
-                    converged = True
+                    converged = fresh
                     break
                 trial = point.at(vector + step)
                 trial_errors = self.errors(trial)
@@ -301,15 +304,20 @@ class Problem:
                     break
                 damping = max(10 * damping, 1e-3)
             if not accepted:
-                break
-            little = cost - trial_cost < max(_ENOUGH, DECIDED * (trial_cost - than))
+                if fresh:
+                    break
+                # derivatives made elsewhere decide nothing
+                normal, damping = None, 0.0
+                continue
+            fell = cost - trial_cost
+            little = fell < max(_ENOUGH, DECIDED * (trial_cost - than))
             point, vector, errors, nu, cost = (
                 trial, vector + step, trial_errors, trial_nu, trial_cost,
             )  # fmt: skip
             damping = damping / 10 if damping > 1e-5 else 0.0
-            if little:
-                converged = True
-            if not normal.near(vector):
+            converged = little and fresh
+            # as long as −2 log L falls as promised, the derivatives serve
+            if not (normal.near(vector) or (abs(fell / promise - 1) < _AS_PROMISED and not little)):
                 normal = None
         return Fit(point, noise, cost, tuple(nu), tuple(errors), converged, self.runs[0].integrator)
 

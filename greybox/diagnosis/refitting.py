@@ -15,7 +15,7 @@ from greybox.diagnosis.noise import SEEN
 from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.scores import ProjectedScores, Score, score_hypotheses
-from greybox.numerics.parallel import lanes, map_forked
+from greybox.numerics.parallel import map_forked
 
 Array = NDArray[np.float64]
 Told = TypeVar("Told")
@@ -27,8 +27,6 @@ _PROMISING = 0.04
 # errors that are seen and remembered for more samples than this may be a cause's; they are
 # then looked at with so short a memory, so many causes more tried
 _SLOW, _FORGOTTEN, _SECOND = 30.0, 3.0, 4
-# processes at most that score the hypotheses at one fit: each projects its errors anew
-_SHARES = 4
 # iterations of a refit before its noise is settled
 FIRST = 12
 # rounds of noise and fit for a cause that was taken
@@ -121,26 +119,22 @@ def promises(
     a cause promises is hidden, and its search ends where it began. What promises most to errors
     that forget is to be judged with their likeliest colour.
     """
-    ways = [False, *([True] if slow(fit) else [])]
-    shares = int(np.clip(lanes() // len(ways), 1, _SHARES))
-    pieces = [(forgets, first) for forgets in ways for first in range(shares)]
     keys = [h.key for h in hypotheses]
 
-    def work(piece: tuple[bool, int]) -> tuple[Fit, list[tuple[int, Array, float]]]:
-        forgets, first = piece
+    def work(forgets: bool) -> tuple[Fit, list[tuple[int, Array, float]]]:
         at = problem.forgetful(fit, _FORGOTTEN) if forgets else fit
-        found = score_hypotheses(ProjectedScores(problem, at), hypotheses[first::shares])
-        told = [(keys.index(s.hypothesis.key), s.value, s.gain) for s in found]
+        told = score_hypotheses(ProjectedScores(problem, at), hypotheses)
         # hypotheses are functions, which no other process can send
-        return replace(at, point=replace(at.point, hypotheses=())), told
+        numbers = [(keys.index(s.hypothesis.key), s.value, s.gain) for s in told]
+        return replace(at, point=replace(at.point, hypotheses=())), numbers
 
-    made = map_forked(work, pieces)
     found = []
-    for k in range(0, len(made), shares):
-        told = sorted((t for _, part in made[k : k + shares] for t in part), key=lambda t: t[0])
-        scores = [Score(hypotheses[i], value, gain) for i, value, gain in told]
-        at = replace(made[k][0], point=fit.point)
-        found.append((at, sorted(scores, key=lambda s: -s.gain)))
+    for at, numbers in map_forked(work, [False, True] if slow(fit) else [False]):
+        scores = [
+            Score(hypotheses[i], value, gain)
+            for i, value, gain in sorted(numbers, key=lambda n: n[0])
+        ]
+        found.append((replace(at, point=fit.point), sorted(scores, key=lambda s: -s.gain)))
     plain, *forgetful = found
     later = [(at, score) for at, scores in forgetful for score in shortlist(scores)[:_SECOND]]
     return plain[1], later

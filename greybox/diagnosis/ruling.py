@@ -30,7 +30,6 @@ from greybox.diagnosis.thresholds import (
     WORTH,
 )
 from greybox.model.run.step import Integrator
-from greybox.numerics.parallel import map_forked
 
 Array = NDArray[np.float64]
 
@@ -99,8 +98,8 @@ def rule(
     pairs = held_out(final.integrator).pairs(final)
     diagnosed = held_out(found.before.integrator).pairs(found.before)
     # of one and the same fit it is computed once
-    first, *other = map_forked(omnibus, [diagnosed, pairs] if diagnosed is not pairs else [pairs])
-    left = other[0] if other else first
+    first = omnibus(diagnosed)
+    left = omnibus(pairs) if diagnosed is not pairs else first
     explained = _explained(found, held_out) if stand else 0.0
     why = _wrong(found.base, final, pairs, left, explained, bool(stand))
     if found.given is not None and not why:

@@ -432,19 +432,39 @@ def _backward(
 ) -> tuple[Fit, list[Candidate]]:
     """Drop causes that a later one made needless; those kept are told against that."""
     kept = list(causes)
-    problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
-    for cause in causes[:-1]:
-        without = _without(problem, fit, cause)
-        proof = held_out.prove(without, fit)
-        alone = assess_candidate(proof, without, fit, cause.hypothesis, tried, cause.names)
-        place = [c.hypothesis.key for c in kept].index(cause.hypothesis.key)
-        if alone.holds:
+    waiting = list(causes[:-1])
+    while waiting:
+        dropped = None
+        for cause, (without, proof) in zip(waiting, _left_out(case, fit, waiting), strict=True):
+            alone = assess_candidate(proof, without, fit, cause.hypothesis, tried, cause.names)
+            place = [c.hypothesis.key for c in kept].index(cause.hypothesis.key)
+            if not alone.holds:
+                _log.info("%s is left out", cause.hypothesis.key)
+                del kept[place]
+                dropped = without
+                break
             kept[place] = alone
-        else:
-            _log.info("%s is left out", cause.hypothesis.key)
-            fit = without
-            del kept[place]
+        if dropped is None:
+            break
+        # the rest is told against the fit that is left
+        fit, waiting = dropped, waiting[waiting.index(cause) + 1 :]
     return fit, kept
+
+
+def _left_out(
+    case: DiagnosisProblem, fit: Fit, causes: Sequence[Candidate]
+) -> list[tuple[Fit, Proof]]:
+    """Return the fit without each of several causes, and what that cause does for held-out logs."""
+    problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
+    # once for all of them
+    problem.rows(fit.point, fit.noise)
+    held_out.contributions(fit)
+
+    def work(k: int) -> tuple[Fit, Proof]:
+        without = _without(problem, fit, causes[k])
+        return without, held_out.prove(without, fit)
+
+    return on_all_processors([problem.drop(fit.point, c.hypothesis) for c in causes], work)
 
 
 def _needed(case: DiagnosisProblem, fit: Fit, without: Fit) -> bool:

@@ -6,6 +6,7 @@ depend neither on how many processes there are nor on which of them computes wha
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import multiprocessing
 import os
@@ -50,6 +51,10 @@ _clients: dict[str, Client] = {}
 _one_at_a_time = threading.Lock()
 # what the copies of this process are to do: they inherit it, so that it need not be sent
 _work: tuple[Callable[[Any], Any], Sequence[Any]] | None = None
+# whether this process computes ahead of the first one, and may share that with copies of its own
+_is_ahead = False
+# prctl's option that asks for a signal once the parent is gone
+_PARENT_GONE = 1
 
 
 def processors() -> int:
@@ -89,7 +94,8 @@ def on_cluster(address: str | None) -> Iterator[None]:
 
 def _first() -> bool:
     """Whether this process is no worker of a map itself: those compute what is inside here."""
-    return not _for_cluster.get() and multiprocessing.current_process().name == "MainProcess"
+    name = multiprocessing.current_process().name
+    return not _for_cluster.get() and (_is_ahead or name == "MainProcess")
 
 
 def _cluster() -> str | None:
@@ -190,7 +196,8 @@ def map_forked(
 def ahead(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
     """Let a copy of this process compute what may be needed later, while this one goes on.
 
-    Where a process cannot be copied, or a cluster computes, it is computed once it is asked for.
+    The copy shares its maps with copies of its own. Where a process cannot be copied, or a cluster
+    computes, it is computed once it is asked for.
 
     Parameters
     ----------
@@ -210,11 +217,13 @@ def ahead(function: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
     received, sent = context.Pipe(duplex=False)
 
     def work(first: int) -> None:
-        _begin_worker(first)
+        global _is_ahead
+        _begin_copy(first)
+        _is_ahead = True
         with suppress(Exception):
             sent.send(function())
 
-    copy = context.Process(target=work, args=(os.getpid(),), daemon=True)
+    copy = context.Process(target=work, args=(os.getpid(),))
     copy.start()
     sent.close()
 
@@ -241,7 +250,7 @@ def _by_copies(
 
     def begin(left: int) -> Executor:
         context = multiprocessing.get_context("fork")
-        return ProcessPoolExecutor(min(count, left), context, _begin_worker, (os.getpid(),))
+        return ProcessPoolExecutor(min(count, left), context, _begin_copy, (os.getpid(),))
 
     def give(pool: Executor, k: int) -> Future[Any]:
         global _work
@@ -279,12 +288,28 @@ def _one(index: int) -> Any:
     return function(pieces[index])
 
 
-def _begin_worker(first: int) -> None:
-    """Let a worker compute in one thread, leave Ctrl-C to the first process, and end with it."""
+def _alone() -> None:
+    """Let a worker compute in one thread, and leave Ctrl-C to the first process."""
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _begin_copy(first: int) -> None:
+    """Let a copy of a process compute alone, and end with that process."""
+    global _is_ahead
+    _is_ahead = False
+    _alone()
+    # without a thread that looks: only a process of one thread can be copied again
+    ctypes.CDLL(None).prctl(_PARENT_GONE, signal.SIGKILL)
+    if os.getppid() != first:
+        os._exit(1)
+
+
+def _begin_worker(first: int) -> None:
+    """Let a process that was begun anew compute alone, and end with the first one."""
+    _alone()
 
     def end_with_first() -> None:
         while os.getppid() == first:

@@ -62,6 +62,12 @@ with ahead(lambda: [os.getpid()]) as one, ahead(lambda: fails(7)) as other:
         assert str(error) == "piece 7 has no model."
     else:
         raise AssertionError("nothing was raised")
+
+# what is computed ahead is shared among copies, and none of those shares on
+with ahead(lambda: (os.getpid(), map_forked(piece, range(5)))) as shared:
+    copy, found = shared()
+assert len({os.getpid(), copy} | {pid for _, pid, _ in found}) > 2 or not apart
+assert all(alone == 1 for _, _, alone in found)
 """
 # the first worker that meets piece 3 dies at it
 DYING = """
