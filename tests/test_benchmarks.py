@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from greybox.model.run.compiled import cache_folder
 from greybox.numerics.compiler import find_compiler
+from greybox.numerics.machine_code import cache_folder
 
 ROOT = Path(__file__).parents[1]
 

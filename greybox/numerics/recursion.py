@@ -1,20 +1,24 @@
 """Linear recursions over samples, all columns and all runs at once.
 
-S(k+1) = A(k) S(k) + B(k) is linear in S(0): stretches of samples are followed side by
-side from nothing, and what each begins with is added afterwards. With few columns the
-recursion is one banded triangular system in all samples, which a library solves sooner.
+S(k+1) = A(k) S(k) + B(k) is three loops of C where there is a compiler. Elsewhere it is linear in
+S(0): stretches of samples are followed side by side from nothing, and what each begins with is
+added afterwards. With few columns the recursion is one banded triangular system in all samples,
+which a library solves sooner.
 """
 
 from __future__ import annotations
 
+import ctypes
 import math
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
+
+from greybox.numerics.machine_code import SHOWN, Library
 
 Array = NDArray[np.float64]
 
@@ -24,6 +28,43 @@ _FEW = 8
 _MANY = 16
 # samples that a filter takes at once, and signals from which on that is the faster way
 _AT_ONCE, _SIGNALS = 32, 4
+
+
+_RECURSION = """
+void greybox_recursion(long long runs, long long steps, long long n, long long m,
+                       const double* restrict a, const double* restrict b, double* restrict s) {
+  long long run, k, i, j, l;
+  for (run = 0; run < runs; run++) {
+    for (k = 0; k < steps; k++) {
+      double* restrict next = s + n * m;
+      for (i = 0; i < n; i++) {
+        for (j = 0; j < m; j++) next[i * m + j] = b[i * m + j];
+        for (l = 0; l < n; l++) {
+          const double share = a[i * n + l];
+          for (j = 0; j < m; j++) next[i * m + j] += share * s[l * m + j];
+        }
+      }
+      a += n * n; b += n * m; s = next;
+    }
+    s += n * m;
+  }
+}
+"""
+
+
+_LIBRARY = Library(
+    lambda: SHOWN + _RECURSION,
+    "greybox_recursion",
+    [ctypes.c_longlong] * 4 + [ctypes.c_void_p] * 3,
+    _RECURSION,
+)
+
+
+@cache
+def _compiled() -> Callable[..., None] | None:
+    """Return the recursion as machine code; None where there is no compiler."""
+    # compiled at the first call, however short: the same command gives the same digits each time
+    return _LIBRARY.found() or _LIBRARY.made()
 
 
 def propagate(a: Array, b: Array, start: Array) -> Array:
@@ -46,12 +87,16 @@ def propagate(a: Array, b: Array, start: Array) -> Array:
     lead, (steps, n, columns) = b.shape[:-3], b.shape[-3:]
     runs = math.prod(lead)
     a, b = a.reshape(runs, steps, n, n), b.reshape(runs, steps, n, columns)
-    out = np.empty((steps + 1, runs, n, columns)) if runs >= _MANY else None
+    in_c = _compiled()
+    out = np.empty((steps + 1, runs, n, columns)) if runs >= _MANY and in_c is None else None
     found = np.empty((runs, steps + 1, n, columns)) if out is None else out.swapaxes(0, 1)
     found[:, 0] = start.reshape(runs, n, columns)
     if found.size and steps:
         with np.errstate(over="ignore", invalid="ignore"):
-            if out is not None:
+            if in_c is not None:
+                given = [np.ascontiguousarray(x, dtype=float) for x in (a, b)]
+                in_c(runs, steps, n, columns, *(x.ctypes.data for x in (*given, found)))
+            elif out is not None:
                 _stepped(a, b, out)
             elif columns <= _FEW and n < _FEW:
                 for each in zip(a, b, found, strict=True):

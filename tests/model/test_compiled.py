@@ -15,6 +15,7 @@ from greybox.model.run import compiled
 from greybox.model.run.kernels import FreeRunKernel, FreeRunStep
 from greybox.model.run.output_runs import Filter, Simulator
 from greybox.model.run.step import StepModel
+from greybox.numerics import machine_code, recursion
 from greybox.study.chapter6 import START, TRUE, pulse_forces
 
 STRUCTURE = get_structure("thesis")
@@ -25,6 +26,8 @@ needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="there is
 @pytest.fixture
 def cache(monkeypatch, tmp_path):
     """Compile each step at once, into a folder of this test."""
+    # what all runs share is opened before
+    recursion.propagate(np.eye(1)[None], np.eye(1)[None], np.eye(1))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(compiled, "_LOOK", 0)
     monkeypatch.setattr(compiled, "_PAYS", 0)
@@ -92,13 +95,13 @@ def test_output_runs_side_by_side_are_the_same(cache, interpreted):
 def test_what_was_compiled_before_is_opened(cache, monkeypatch):
     expected = kernel()().copy()
     compiled.loop_of.cache_clear()
-    monkeypatch.setattr(compiled, "find_compiler", lambda: pytest.fail("it was compiled again"))
+    monkeypatch.setattr(machine_code, "find_compiler", lambda: pytest.fail("it was compiled again"))
     np.testing.assert_array_equal(kernel()(), expected)
 
 
 def test_steps_are_interpreted_until_compiling_pays(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(compiled, "find_compiler", lambda: None)
+    monkeypatch.setattr(machine_code, "find_compiler", lambda: None)
     loop = compiled.Loop(STEP.function, 1)
     assert not loop.pays(1)
     assert not (tmp_path / "greybox").exists()
@@ -111,21 +114,21 @@ def test_without_a_compiler_or_a_folder_of_ones_own_casadi_runs(
 ):
     expected = interpreted(lambda: kernel()().copy())
     if what == "no compiler":
-        monkeypatch.setattr(compiled, "find_compiler", lambda: None)
+        monkeypatch.setattr(machine_code, "find_compiler", lambda: None)
     elif what == "open to others":
         cache.mkdir(mode=0o700)
         cache.chmod(0o777)
     elif what == "no folder":
         cache.write_text("")
     else:
-        monkeypatch.setattr(compiled, "shared_library", lambda *_: b"no library")
+        monkeypatch.setattr(machine_code, "shared_library", lambda *_: b"no library")
     np.testing.assert_array_equal(kernel()(), expected)
     assert not compiled.loop_of(STEP.function, 1).pays(1)
 
 
 @needs_compiler
 def test_few_libraries_are_kept(cache, monkeypatch):
-    monkeypatch.setattr(compiled, "_MOST", 1)
+    monkeypatch.setattr(machine_code, "_MOST", 1)
     for rule in ("rk4", "euler"):
         step = FreeRunStep(StepModel.free(STRUCTURE, rule)).function
         assert compiled.loop_of(step, 1).pays(1)

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from greybox.numerics import recursion
 from greybox.numerics.recursion import filtered, propagate
+
+
+@pytest.fixture(params=["machine code", "no compiler"], autouse=True)
+def way(request, monkeypatch):
+    """Each way to compute the same."""
+    if request.param == "no compiler":
+        monkeypatch.setattr(recursion, "_compiled", lambda: None)
 
 
 def looped(a, b, start):

@@ -9,35 +9,20 @@ interpreted as takes as long, and what is compiled is kept in a folder of the us
 from __future__ import annotations
 
 import ctypes
-import logging
-import os
-import platform
-import stat
-import sys
 from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
-from hashlib import sha256
-from pathlib import Path
-from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import GreyboxError
-from greybox.files import replacing
-from greybox.numerics.compiler import FLAGS, find_compiler, shared_library
+from greybox.numerics.machine_code import SHOWN, Library
 
 Array = NDArray[np.float64]
-# of the samples, and of pointers to arguments and to results
-Run = Callable[[int, Any, Any], None]
-_log = logging.getLogger(__name__)
 
 # instructions that take CasADi about 2 ms, as long as it takes to open what was compiled before,
 # and a quarter of a second, as long as the compiler takes
 _LOOK, _PAYS = 10**6, 3 * 10**7
-# libraries that are kept, some 16 kB each
-_MOST = 500
 # `step` and `along` are names of the C library or may be: these are nobody's
 _STEP, _LOOP = "greybox_step", "greybox_loop"
 
@@ -68,26 +53,7 @@ def _source(step: ca.Function, loop: str) -> str:
     generator = ca.CodeGenerator("step", {"casadi_int": "int", "casadi_real": "double"})
     given = [ca.SX.sym(step.name_in(i), step.sparsity_in(i)) for i in range(step.n_in())]
     generator.add(ca.Function(_STEP, given, step.call(given)))
-    shown = '__attribute__((visibility("default")))\n'
-    return str(generator.dump()) + shown + loop
-
-
-def cache_folder() -> Path | None:
-    """Return the folder of the user's own in which libraries are kept, made where it is not there.
-
-    None where there is none, or others may write to it: what it holds is run.
-    """
-    if not hasattr(os, "getuid"):
-        return None
-    try:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(base) / "greybox"
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        about = folder.lstat()
-    except (OSError, RuntimeError):
-        return None
-    own = stat.S_ISDIR(about.st_mode) and about.st_uid == os.getuid()
-    return folder if own and stat.S_IMODE(about.st_mode) == 0o700 else None
+    return str(generator.dump()) + SHOWN + loop
 
 
 class Loop:
@@ -106,65 +72,24 @@ class Loop:
         self._step, self._carried = step, carried
         self._taken = 0
         self._opened = self._compiled = False
-        self._run: Run | None = None
+        self._run: Callable[..., None] | None = None
 
     def pays(self, samples: int) -> bool:
         """Return whether the next `samples` steps are to be taken here, and count them."""
         if self._run is None and not self._compiled:
             self._taken += samples * self._step.n_instructions()
             if self._taken >= _LOOK and not self._opened:
-                self._opened, self._run = True, self._found()
+                self._opened, self._run = True, self._library.found()
             if self._taken >= _PAYS and self._run is None:
-                self._compiled, self._run = True, self._made()
+                self._compiled, self._run = True, self._library.made()
         return self._run is not None
 
     @cached_property
-    def _text(self) -> str:
-        return _loop_text(self._step, self._carried)
-
-    @cached_property
-    def _place(self) -> Path | None:
-        """The file of the library, named by all that it follows from."""
-        folder = cache_folder()
-        if folder is None:
-            return None
-        all_of_it = (
-            self._step.serialize(), self._text, ca.CasadiMeta.version(), *FLAGS, sys.platform,
-            platform.machine(),
-        )  # fmt: skip
-        return folder / f"{sha256(repr(all_of_it).encode()).hexdigest()}.so"
-
-    def _found(self) -> Run | None:
-        """Return the function of a library that was compiled before."""
-        if self._place is None or not self._place.is_file():
-            return None
-        try:
-            os.utime(self._place)
-            run = ctypes.CDLL(str(self._place))[_LOOP]
-        except (OSError, AttributeError) as error:
-            _log.info("%s cannot be opened: %s", self._place, error)
-            return None
-        run.argtypes, run.restype = [ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p], None
-        return run
-
-    def _made(self) -> Run | None:
-        """Compile, keep, and return the function."""
-        if self._place is None:
-            return None
-        try:
-            compiler = find_compiler()
-            if compiler is None:
-                return None
-            library = shared_library(compiler, {"step.c": _source(self._step, self._text)}, ())
-            with replacing(self._place, "wb") as handle:
-                handle.write(library)
-            kept = sorted(self._place.parent.glob("*.so"), key=lambda p: p.stat().st_mtime)
-            for old in kept[:-_MOST]:
-                old.unlink(missing_ok=True)
-        except (GreyboxError, OSError) as error:
-            _log.info("a step is not compiled: %s", error)
-            return None
-        return self._found()
+    def _library(self) -> Library:
+        loop = _loop_text(self._step, self._carried)
+        key = (self._step.serialize(), loop, ca.CasadiMeta.version())
+        arguments = [ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p]
+        return Library(lambda: _source(self._step, loop), _LOOP, arguments, repr(key))
 
     def __call__(self, samples: int, given: Sequence[Array], out: Sequence[Array]) -> None:
         """Take steps; only after `pays` said so.
