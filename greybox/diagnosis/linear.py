@@ -107,7 +107,8 @@ class Slopes:
         own = theta[..., self._active]
         given = (drivers[:-1], own if own.ndim == 1 else own[:-1])
         columns = np.concatenate([np.arange(nx), nx + np.asarray(places, int)])
-        state, driven = np.split(self._rates(at, *given, columns)[1], [nx], axis=2)
+        slopes = self._rates(at.T.copy(), *given, columns)[1].transpose(2, 0, 1)
+        state, driven = np.split(np.ascontiguousarray(slopes), [nx], axis=2)
         if not self._step.structure.increment:
             return Linear(state, driven)
         one = np.eye(nx)
@@ -124,37 +125,35 @@ class Slopes:
     def _rates(
         self, at: Array, drivers: Array, own: Array, columns: NDArray[np.int_]
     ) -> tuple[Array, Array]:
-        """Return the rate (N, nx) at states (N, nx), and its derivatives (N, nx, columns)."""
-        nx, steps = self._states, len(at)
-        values: list[Array | float] = [*at.T.copy(), *drivers.T.copy()]
+        """Return the rate (nx, N) at states (nx, N), and its derivatives (nx, columns, N)."""
+        nx, steps = at.shape
+        values: list[Array | float] = [*at, *drivers.T.copy()]
         values += list(map(float, own)) if own.ndim == 1 else list(own.T.copy())
         wanted = (np.arange(nx)[:, None] * self._columns + columns).ravel()
         rows = np.concatenate([wanted, nx * self._columns + np.arange(nx)])
         out = self._program(values, np.empty((len(rows), steps)), wanted=rows.tolist())
-        slopes = out[:-nx].reshape(nx, len(columns), steps).transpose(2, 0, 1)
-        return out[-nx:].T, np.ascontiguousarray(slopes)
+        return out[-nx:], out[:-nx].reshape(nx, len(columns), steps)
 
     def _through_stages(
         self, x: Array, drivers: Array, own: Array, columns: NDArray[np.int_]
     ) -> Linear:
         """Return the derivatives of steps from states (N, nx), exactly."""
-        nx, size = self._states, len(columns)
+        (steps, nx), size = x.shape, len(columns)
 
+        # time is last in memory: the state first, and behind it its derivatives
         def slope(full: Array) -> Array:
-            rate, slopes = self._rates(full[:, :, 0], drivers, own, columns)
-            moved = slopes[:, :, :nx] @ full[:, :, 1:]
-            moved[:, :, nx:] += slopes[:, :, nx:]
-            return np.concatenate([rate[:, :, None], moved], axis=2)
+            rate, slopes = self._rates(np.ascontiguousarray(full[:, 0]), drivers, own, columns)
+            out = np.empty_like(full)
+            out[:, 0], out[:, 1 : 1 + nx], out[:, 1 + nx :] = rate, 0.0, slopes[:, nx:]
+            for i in range(nx):
+                for j in range(nx):
+                    out[i, 1:] += slopes[i, j] * full[j, 1:]
+            return out
 
-        start = np.concatenate(
-            [
-                x[:, :, None],
-                np.broadcast_to(np.eye(nx), (len(x), nx, nx)),
-                np.zeros((len(x), nx, size - nx)),
-            ],
-            axis=2,
-        )
-        after = self._step.moved(slope, start)
+        start = np.zeros((nx, 1 + size, steps))
+        start[:, 0] = x.T
+        start[np.arange(nx), 1 + np.arange(nx)] = 1.0
+        after = self._step.moved(slope, start).transpose(2, 0, 1)
         return Linear(*map(np.ascontiguousarray, (after[:, :, 1 : 1 + nx], after[:, :, 1 + nx :])))
 
 
