@@ -684,12 +684,11 @@ def _legs(options: argparse.Namespace, design: Any) -> tuple[Any, dict[str, Any]
     """Return the plan as legs, written where asked for, and what the JSON says of them."""
     if options.legs is None:
         return None, {}
-    from threadpoolctl import threadpool_limits
-
     from experiment_design.output.legs import legs_of
     from experiment_design.output.legs_file import write_legs
+    from greybox.numerics.threads import one_thread
 
-    with threadpool_limits(1, "blas"):
+    with one_thread():
         plan = legs_of(design)
     write_legs(design, plan, Path(options.legs))
     return plan, {"legs": {"file": options.legs, **plan.to_dict()}}

@@ -51,6 +51,7 @@ from experiment_design.request.request import (
     wanted_parameters,
 )
 from greybox.errors import InfeasibleError
+from greybox.numerics.threads import one_thread
 from greybox.trial.plan_parts import LEAD_IN, TRIAL
 
 Array = NDArray[np.float64]
@@ -108,10 +109,7 @@ def design_trial(
     Ljungberg (2020), A10, A15 and section 5.2 for the margins; Atkinson, Donev and
     Tobias (2007) for the criteria.
     """
-    from threadpoolctl import threadpool_limits
-
-    # many small matrix products: threads of BLAS only get in each other's way
-    with threadpool_limits(1, "blas"):
+    with one_thread():
         return _design(request, best_effort, progress, workers, first, alternatives)
 
 

@@ -38,7 +38,7 @@ from greybox.diagnosis.thresholds import SIGNIFICANT
 from greybox.errors import UsageError, suggestion
 from greybox.files import read_json
 from greybox.model.model import ManoeuvringModel
-from greybox.public import one_thread
+from greybox.numerics.threads import one_thread
 
 Array = NDArray[np.float64]
 
@@ -322,7 +322,7 @@ def _sizes(cause: OpenCause) -> str:
     return f"{told} ({'as estimated' if cause.estimated else 'a typical size'})"
 
 
-@one_thread
+@one_thread()
 def design_for_causes(
     request: PreparedRequest,
     model: ManoeuvringModel,

@@ -33,6 +33,7 @@ from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
+from greybox.numerics.threads import one_thread
 from greybox.trial.plan_parts import LEAD_IN, TRIAL, VALIDATION
 
 Array = NDArray[np.float64]
@@ -249,9 +250,7 @@ def design_for_prediction(
     ----------
     Box and Draper (1959); DuMouchel and Jones (1994).
     """
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(1, "blas"):
+    with one_thread():
         return _design(request, model, envelope or {}, kept_starts, sailed, workers)
 
 

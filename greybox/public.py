@@ -1,4 +1,4 @@
-"""What promised names share: loaded at first use, keywords checked, one thread."""
+"""What promised names share: loaded at first use, keywords checked."""
 
 from __future__ import annotations
 
@@ -65,21 +65,3 @@ def known_keywords(function: Callable[P, R]) -> Callable[P, R]:
         return function(*args, **kwargs)
 
     return checked
-
-
-def one_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Let a function's linear algebra run in one thread, and give the others back after it.
-
-    On small matrices several threads would only wait for one another.
-    """
-
-    @functools.wraps(function)
-    def alone(*args: P.args, **kwargs: P.kwargs) -> R:
-        # only loaded libraries can be told so
-        import scipy.linalg  # noqa: F401
-        from threadpoolctl import threadpool_limits
-
-        with threadpool_limits(1):
-            return function(*args, **kwargs)
-
-    return alone

@@ -36,11 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Go round the loop and write the page."""
-    from threadpoolctl import threadpool_limits
-
     from experiment_design.demo.loop import run_demo
     from experiment_design.demo.page import demo_page
     from experiment_design.demo.steps import Step
+    from greybox.numerics.threads import one_thread
     from greybox.report.page import write_page
 
     count = 0
@@ -57,7 +56,7 @@ def run(options: argparse.Namespace) -> None:
         ]
         say("\n".join(lines))
 
-    with threadpool_limits(1):
+    with one_thread():
         demo = run_demo(
             options.out, effect=options.effect, seed=options.seed, tell=tell, progress=_log.info
         )

@@ -17,7 +17,7 @@ from greybox.commands.common import (
     read_logs,
     require_model_name,
 )
-from greybox.public import one_thread
+from greybox.numerics.threads import one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -91,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_cluster(parser)
 
 
-@one_thread
+@one_thread()
 def run(options: argparse.Namespace) -> None:
     """Read, diagnose, report, write."""
     from dataclasses import replace

@@ -22,7 +22,7 @@ from greybox.commands.common import (
 from greybox.estimation.registry import ESTIMATORS
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.numerics.effort import EFFORT
-from greybox.public import one_thread
+from greybox.numerics.threads import one_thread
 
 if TYPE_CHECKING:
     from greybox.estimation.result import Estimate
@@ -330,7 +330,7 @@ def _with_verdict_of(estimate: Estimate, judged: Estimate) -> Estimate:
     return replace(estimate, prediction=judged.prediction)
 
 
-@one_thread
+@one_thread()
 def run(options: argparse.Namespace) -> None:
     """Read, estimate, report, write."""
     from greybox.errors import UsageError

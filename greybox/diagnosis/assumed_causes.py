@@ -15,7 +15,8 @@ from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.refitting import final_refit, likelier, promises, refits
 from greybox.diagnosis.result import Given
 from greybox.diagnosis.search import Search, freed
-from greybox.public import known_keywords, one_thread
+from greybox.numerics.threads import one_thread
+from greybox.public import known_keywords
 from greybox.trial.log import Logs
 from greybox.trial.segments import as_segments
 
@@ -26,7 +27,7 @@ _FORMS = 3
 
 
 @known_keywords
-@one_thread
+@one_thread()
 def fit_given(
     logs: Logs,
     ids: Sequence[str],

@@ -21,7 +21,8 @@ from greybox.diagnosis.search import search, weighed
 from greybox.diagnosis.waves import find_waves, found_waves
 from greybox.model.model import ManoeuvringModel
 from greybox.numerics.parallel import ahead
-from greybox.public import known_keywords, one_thread
+from greybox.numerics.threads import one_thread
+from greybox.public import known_keywords
 from greybox.regression.regression import common_sample_time
 from greybox.selection.estimate import at_own_pace
 from greybox.selection.prediction import require_distinct, require_others
@@ -69,7 +70,7 @@ class DiagnosisOptions:
 
 
 @known_keywords
-@one_thread
+@one_thread()
 # runs of ships that a hypothesis makes unstable leave every number's range, and are judged by that
 @np.errstate(over="ignore", invalid="ignore")
 def diagnose(

@@ -57,7 +57,8 @@ from greybox.model.predictor import Predictor
 from greybox.model.run.output_runs import Simulator
 from greybox.model.run.step import Integrator
 from greybox.numerics.linalg import scaled, scaled_inverse
-from greybox.public import known_keywords, one_thread
+from greybox.numerics.threads import one_thread
+from greybox.public import known_keywords
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import Logs, TrialLog
 from greybox.trial.segments import as_segments
@@ -157,7 +158,7 @@ class OutputErrorOptions:
 
 
 @known_keywords
-@one_thread
+@one_thread()
 def estimate_oe(
     predictor: Predictor,
     logs: Logs,

@@ -46,7 +46,8 @@ from greybox.estimation.verdict import UNJUDGED
 from greybox.model.predictor import Predictor
 from greybox.numerics.banded import factor_band
 from greybox.numerics.effort import require_time
-from greybox.public import known_keywords, one_thread
+from greybox.numerics.threads import one_thread
+from greybox.public import known_keywords
 from greybox.regression.motion import Motion, further_channels, predicted_motion, smoothed_heading
 from greybox.regression.problem import RegressionProblem
 from greybox.regression.regression import measured_rows, within_margins
@@ -191,7 +192,7 @@ class _Refinement:
 
 
 @known_keywords
-@one_thread
+@one_thread()
 def estimate_refined_iv(
     predictor: Predictor,
     logs: Logs,

@@ -21,7 +21,7 @@ from greybox.fleet.trend import FEWEST_PERIODS, Trend, fit_trend
 from greybox.model.terms import parameter_unit
 from greybox.notebook import DisplayMixin
 from greybox.numerics.parallel import map_pieces
-from greybox.public import one_thread
+from greybox.numerics.threads import one_thread
 from greybox.selection.estimate import estimate_requested
 from greybox.selection.request import Request
 from greybox.trial.convert.read import read_segments
@@ -449,7 +449,7 @@ def estimate_fleet(
     return pool_ships(Path(folder).name, model, ships, left_out)
 
 
-@one_thread
+@one_thread()
 def pool_ships(
     name: str,
     model: ClassModel,
@@ -509,7 +509,7 @@ def _class_model(
     return model, rest
 
 
-@one_thread
+@one_thread()
 def _preferred(task: _Task) -> ClassModel | LeftOut:
     """Return how the data of one ship would be estimated."""
     name = task.ship.name
@@ -532,7 +532,7 @@ def _read(ship: ShipFiles, sample_time: float | None = None) -> list[list[TrialL
     return [decimate_segments(segments, sample_time)[0] for segments in logs]
 
 
-@one_thread
+@one_thread()
 def _estimated(task: _Task) -> ShipEstimate | LeftOut:
     """Return one ship's coefficients from all its logs and from each period, or why not."""
     assert task.model is not None

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from greybox.errors import ClusterError, UsageError, WorkerError
 from greybox.numerics.effort import seconds_left, within
+from greybox.numerics.threads import limit_to_one_thread, one_thread
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -290,9 +291,7 @@ def _one(index: int) -> Any:
 
 def _alone() -> None:
     """Let a worker compute in one thread, and leave Ctrl-C to the first process."""
-    from threadpoolctl import threadpool_limits
-
-    threadpool_limits(1)
+    limit_to_one_thread()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -479,13 +478,12 @@ def _remote(sent: bytes, piece: bytes, seconds: float) -> bytes:
     """Compute one piece on a worker, within the seconds that are left for it."""
     from casadi import global_pickle_context, global_unpickle_context
     from distributed.protocol.pickle import dumps, loads
-    from threadpoolctl import threadpool_limits
 
     # CasADi and what a process caches know no second thread, which a worker may have
     with _one_at_a_time:
         token = _for_cluster.set(True)
         try:
-            with threadpool_limits(1), within(seconds):
+            with one_thread(), within(seconds):
                 with global_unpickle_context():
                     function = loads(sent)
                 with global_unpickle_context():

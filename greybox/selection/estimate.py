@@ -35,7 +35,8 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
 from greybox.numerics.effort import EFFORT, seconds_left, within, without_limit
-from greybox.public import known_keywords, one_thread
+from greybox.numerics.threads import one_thread
+from greybox.public import known_keywords
 from greybox.regression.regression import common_sample_time
 from greybox.selection.alternatives import (
     Alternative,
@@ -205,7 +206,7 @@ def estimate_model(
     return estimate_requested(as_segments(logs), asked)
 
 
-@one_thread
+@one_thread()
 def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
     """Return what `estimate_model` does of a request."""
     require_distinct(logs)

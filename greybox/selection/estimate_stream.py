@@ -18,7 +18,7 @@ from greybox.estimation.streamed import Streamed, estimate_sums
 from greybox.model.predictor import Predictor
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.numerics.effort import within
-from greybox.public import one_thread
+from greybox.numerics.threads import one_thread
 from greybox.regression.problem import RegressionProblem, RegressionSettings
 from greybox.selection.estimate import estimate_requested, weighed, with_runs
 from greybox.selection.prediction import refit_alike, with_prediction
@@ -87,7 +87,7 @@ def require_adding(request: Request) -> None:
         )
 
 
-@one_thread
+@one_thread()
 def estimate_stream(
     drawn: Drawn, request: Request, first: Estimate | None = None
 ) -> StreamEstimate:

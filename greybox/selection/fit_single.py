@@ -21,7 +21,8 @@ from greybox.model.predictor import Predictor
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.structure import Structure
 from greybox.numerics.effort import require_time
-from greybox.public import known_keywords, one_thread
+from greybox.numerics.threads import one_thread
+from greybox.public import known_keywords
 from greybox.regression.problem import RegressionProblem
 from greybox.selection.request import Request
 from greybox.trial.log import Logs, TrialLog
@@ -31,7 +32,7 @@ Array = NDArray[np.float64]
 
 
 @known_keywords
-@one_thread
+@one_thread()
 def estimate_ls(
     predictor: Predictor,
     logs: Logs,
@@ -81,7 +82,7 @@ def estimate_ls(
 
 
 @known_keywords
-@one_thread
+@one_thread()
 def estimate_iv(
     predictor: Predictor,
     logs: Logs,

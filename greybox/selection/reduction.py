@@ -19,7 +19,7 @@ from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.predictor import Column
 from greybox.numerics.effort import seconds_left, within
 from greybox.numerics.linalg import scaled_inverse
-from greybox.public import one_thread
+from greybox.numerics.threads import one_thread
 from greybox.selection.alternatives import OVER
 from greybox.selection.estimate import estimate_requested
 from greybox.selection.held_out import rank
@@ -146,7 +146,7 @@ def _without(
     return replace(request, structure=name, without=tuple(biases)), dropped
 
 
-@one_thread
+@one_thread()
 def reduce_structure(
     logs: Logs,
     request: Request = CHOOSE,

@@ -16,7 +16,7 @@ from greybox.estimation.tried import Comparison, TriedModel
 from greybox.model.catalogue import structure_for
 from greybox.notebook import DisplayMixin
 from greybox.numerics.effort import Shares, seconds_left, within
-from greybox.public import one_thread
+from greybox.numerics.threads import one_thread
 from greybox.selection.alternatives import OVER
 from greybox.selection.estimate import estimate_requested
 from greybox.selection.fit_single import estimate_once
@@ -245,7 +245,7 @@ def settle(logs: Sequence[TrialLog], request: Request) -> Request:
     )
 
 
-@one_thread
+@one_thread()
 def compare_structures(
     logs: Logs,
     names: Sequence[str],

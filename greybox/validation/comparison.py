@@ -15,7 +15,8 @@ from greybox.errors import UsageError, suggestion
 from greybox.estimation.result import Estimate
 from greybox.model.model import ManoeuvringModel
 from greybox.notebook import DisplayMixin, items, number, table
-from greybox.public import known_keywords, one_thread
+from greybox.numerics.threads import one_thread
+from greybox.public import known_keywords
 from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.trial.validity import ConditionDifference, other_conditions
 from greybox.validation.bands import LEVEL, Bands, predict_bands
@@ -463,7 +464,7 @@ def _to_keep(rows: Sequence[Sequence[_Compared]], most: int) -> set[int]:
     return {*range(min(most, len(rows[0]))), *(int(np.argmin(f)) for f in fits if most)}
 
 
-@one_thread
+@one_thread()
 def compare_each(
     known: Mapping[str, ManoeuvringModel],
     columns: Iterable[Sequence[TrialLog]],

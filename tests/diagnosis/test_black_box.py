@@ -20,7 +20,7 @@ from greybox.diagnosis.gain import run_on
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.result import Diagnosis, Gain, Remainder
 from greybox.model.model import load_model
-from greybox.public import one_thread
+from greybox.numerics.threads import one_thread
 from greybox.report.diagnosis import diagnosis_page
 from greybox.report.page import render
 from greybox.study.blind import Trial, draw
@@ -39,7 +39,8 @@ def trial() -> Trial:
 @pytest.fixture(scope="module")
 def fitted(trial):
     """Return the model without and with bumps, and what they were fitted with."""
-    return one_thread(_fitted)(trial)
+    with one_thread():
+        return _fitted(trial)
 
 
 def _fitted(trial):
