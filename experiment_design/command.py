@@ -20,6 +20,7 @@ from greybox.commands.common import (
     progress,
     provenance,
     say,
+    show_next,
 )
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.registry import Registry
@@ -429,6 +430,7 @@ def _deliver(
     headline: str = "",
 ) -> None:
     """Write the plan and all that was asked for beside it, and tell what was found."""
+    from experiment_design.output.next_steps import after_design
     from experiment_design.output.result import write_plan
     from greybox.files import write_json
 
@@ -449,6 +451,7 @@ def _deliver(
     for path in (options.out, options.legs, options.sheet, options.report, options.save_model):
         if path:
             say(f"wrote {path}")
+    show_next(after_design(provenance(options), bool(headline)))
 
 
 def _duration(options: argparse.Namespace) -> float:

@@ -18,7 +18,8 @@ from greybox.report.error_budget import noise_sentence
 from greybox.report.figures import to_svg
 from greybox.report.log import page_figures
 from greybox.report.model_difference import marked_equations
-from greybox.report.page import Marked, NextStep, Page, Picture, Section, Table, flatten
+from greybox.report.next_steps import NextStep
+from greybox.report.page import Marked, Page, Picture, Section, Table, flatten
 from greybox.validation.comparison import Comparison
 
 

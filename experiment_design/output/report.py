@@ -12,6 +12,7 @@ from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from experiment_design.optimise.search import REFERENCE
+from experiment_design.output.next_steps import after_design
 from experiment_design.output.pictures import draw_commands, draw_plan_track, draw_states, forbidden
 from experiment_design.output.prediction import MotionBand, predict_motion
 from experiment_design.output.result import Design
@@ -19,7 +20,7 @@ from experiment_design.output.sheet_contents import clock, plain_name, signed
 from experiment_design.request.regimes import spell_regime
 from greybox.report.chart import chart_of
 from greybox.report.figures import BLUE, ORANGE, new_figure, tidy, to_svg
-from greybox.report.page import NextStep, Page, Picture, Section, Table, computed, typed
+from greybox.report.page import Page, Picture, Section, Table, computed
 
 Array = NDArray[np.float64]
 
@@ -73,7 +74,7 @@ def design_page(
         headline=headline or (UNTRIED if r.untried else "") + saving(design),
         sentences=[_sentence(s) for s in said],
         lead=parts[0].pictures[0],
-        next_steps=_next_steps(record, bool(headline)),
+        next_steps=after_design(record, bool(headline)),
         pictures=[*(shown[0].pictures if one else []), *_std_pictures(design, reference)],
         tables=[
             *([_std_table(design, reference)] if np.isfinite(design.std).all() else []),
@@ -83,33 +84,6 @@ def design_page(
         computed=computed(record),
         sections=[] if one else shown,
     )  # fmt: skip
-
-
-def _next_steps(record: dict[str, Any], headline: bool) -> list[NextStep]:
-    """Return what to do once the plan has been sailed."""
-    vessel, given = typed(record, "vessel", "V"), record.get("command", {})
-    check = NextStep(
-        "Sail the plan, and check its log before you leave the area",
-        f"greybox check LOG --vessel {vessel} --report check.html",
-    )
-    explain = any(map(given.get, ("between", "causes", "diagnosis")))
-    if explain or given.get("purpose") == "causes":
-        return [
-            check,
-            NextStep(
-                "See which of the explanations the log supports",
-                f"greybox diagnose LOG --vessel {vessel} --report diagnosis.html",
-            ),
-        ]
-    # one for prediction has a part to judge by
-    part = f" --plan {typed(record, 'out', 'PLAN')}" if headline else ""
-    return [
-        check,
-        NextStep(
-            "Estimate the model from it",
-            f"greybox estimate LOG --vessel {vessel}{part} --out model.json --report model.html",
-        ),
-    ]
 
 
 def _sentence(text: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from greybox.commands.common import VESSEL_HELP, add_memory, provenance, say
+from greybox.commands.common import VESSEL_HELP, add_memory, provenance, say, show_next
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -64,6 +64,7 @@ def run(options: argparse.Namespace) -> None:
     from textwrap import indent
 
     from greybox.files import check_targets, write_json
+    from greybox.report.next_steps import after_check
     from greybox.trial.checks.check import check_files, require_each_once
     from greybox.trial.checks.finding import shared_findings
     from greybox.trial.log_files import find_logs
@@ -123,3 +124,4 @@ def run(options: argparse.Namespace) -> None:
             )
         if options.report:
             say(f"\nwrote {options.report}")
+        show_next(after_check(reports, record))

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from greybox.commands.terminal import complain, progress, say
 
 if TYPE_CHECKING:
+    from greybox.report.next_steps import NextStep
     from greybox.report.page import Page
     from greybox.trial.log import TrialLog
     from greybox.vessel.vessel import Vessel
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = [
     "VESSEL_HELP", "add_cluster", "add_logs", "add_memory", "add_outputs", "add_seed", "complain",
     "count", "positive", "progress", "provenance", "publish", "read_logs", "say",
+    "show_next",
 ]  # fmt: skip
 
 # endings of what is no model
@@ -58,6 +60,7 @@ def publish(
     result: Mapping[str, Any],
     summary: str,
     page: Callable[[], Page],
+    next_steps: Sequence[NextStep],
     written: Sequence[str | None] = (),
 ) -> None:
     """Write a result where --json and --report ask for it, and show it on the terminal.
@@ -70,6 +73,8 @@ def publish(
         Shown unless the JSON goes to the terminal, with the files that were `written` before.
     page : callable
         Makes the page.
+    next_steps : sequence of NextStep
+        Shown behind the files.
     """
     from greybox.files import write_json
 
@@ -83,6 +88,13 @@ def publish(
         say(summary)
         for path in filter(None, (*written, options.report)):
             say(f"wrote {path}")
+        show_next(next_steps)
+
+
+def show_next(steps: Sequence[NextStep]) -> None:
+    """Show on the terminal what to do next."""
+    for step in steps:
+        say(step.line())
 
 
 def positive(text: str) -> float:

@@ -57,6 +57,7 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.files import check_targets
     from greybox.model.model import load_model
+    from greybox.report.next_steps import after_comparison
     from greybox.trial.checks.check import misnamed_columns
     from greybox.trial.convert.read import read_log
     from greybox.trial.log_files import find_logs
@@ -101,4 +102,6 @@ def run(options: argparse.Namespace) -> None:
 
         return comparison_page(comparison, models, record)
 
-    publish(options, comparison.to_dict() | {"provenance": record}, comparison.summary(), page)
+    told = comparison.to_dict() | {"provenance": record}
+    steps = [after_comparison(comparison, models, record)]
+    publish(options, told, comparison.summary(), page, steps)

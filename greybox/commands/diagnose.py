@@ -163,7 +163,8 @@ def run(options: argparse.Namespace) -> None:
         return diagnosis_page(diagnosis, record)
 
     told = diagnosis.to_dict() | told | {"provenance": record}
-    publish(options, told, diagnosis.summary(), page, [options.out])
+    # its summary tells them
+    publish(options, told, diagnosis.summary(), page, [], [options.out])
 
 
 def _with_files(steps: Sequence[str], record: Mapping[str, Any]) -> list[str]:
@@ -171,7 +172,7 @@ def _with_files(steps: Sequence[str], record: Mapping[str, Any]) -> list[str]:
     from pathlib import Path
     from shlex import quote
 
-    from greybox.report.page import typed
+    from greybox.report.next_steps import typed
 
     out = record["command"].get("out")
     model = Path(out or "mended.json")

@@ -338,6 +338,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets
     from greybox.model.catalogue import get_structure, structure_for
     from greybox.model.model import load_model
+    from greybox.report.next_steps import after_estimate
     from greybox.report.physical import physical_summary
     from greybox.selection.estimate import estimate_requested
     from greybox.selection.estimate_stream import BYTES, estimate_stream, require_adding
@@ -445,4 +446,5 @@ def run(options: argparse.Namespace) -> None:
 
         return estimation_page(estimate, as_read(logs, estimate), made, choice=choice, mass=mass)
 
-    publish(options, model.to_dict(), "\n\n".join(summaries), page, [options.out])
+    steps = after_estimate(estimate, made)
+    publish(options, model.to_dict(), "\n\n".join(summaries), page, steps, [options.out])

@@ -60,6 +60,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets, sha256, write_text
     from greybox.fleet.fleet import estimate_fleet
     from greybox.fleet.ships import fleet_files
+    from greybox.report.next_steps import after_fleet
 
     check_targets(options.out, options.json, options.report)
     _require_outside(options)
@@ -77,4 +78,4 @@ def run(options: argparse.Namespace) -> None:
         return fleet_page(fleet, record)
 
     told = fleet.to_dict() | {"provenance": record}
-    publish(options, told, fleet.summary(), page, [options.out])
+    publish(options, told, fleet.summary(), page, after_fleet(fleet, record), [options.out])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from greybox.commands.common import VESSEL_HELP, positive, provenance, say
+from greybox.commands.common import VESSEL_HELP, positive, provenance, say, show_next
 
 if TYPE_CHECKING:
     from greybox.trial.convert.options import ImportOptions
@@ -141,6 +141,7 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.errors import UsageError, suggestion
     from greybox.files import check_targets, write_json
+    from greybox.report.next_steps import after_import
     from greybox.trial.import_files import LOG_SUFFIXES, import_files, is_folder, targets
     from greybox.trial.store import read_record, record_path
     from greybox.vessel.conditions import UNITS
@@ -185,6 +186,7 @@ def run(options: argparse.Namespace) -> None:
         written = ", ".join(str(log) for log in logs)
         beside = "its record" if len(logs) == 1 else "their records"
         say(f"wrote {written} and {record_path(logs[0]).name if not folder else beside}")
+        show_next([after_import(options.out, options.vessel)])
 
 
 def import_options(options: argparse.Namespace) -> ImportOptions:

@@ -137,6 +137,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets
     from greybox.model.model import load_model
     from greybox.prediction.predict import predict_manoeuvre
+    from greybox.report.next_steps import after_prediction, typed
 
     check_targets(options.json, options.report, options.out)
     angles = [_angle(text) for text in options.angle]
@@ -171,14 +172,16 @@ def run(options: argparse.Namespace) -> None:
     record = provenance(options)
     written = _write_runs(made, options.out) if options.out else []
 
+    vessel = typed(model.record.get("provenance", {}), "vessel", "V")
+
     def page() -> Page:
-        from greybox.report.page import typed
         from greybox.report.prediction import prediction_page
 
-        vessel = typed(model.record.get("provenance", {}), "vessel", "V")
         return prediction_page(made, record, vessel)
 
-    publish(options, made.to_dict() | {"provenance": record}, made.summary(), page, written)
+    result = made.to_dict() | {"provenance": record}
+    steps = after_prediction(made, record, vessel)
+    publish(options, result, made.summary(), page, steps, written)
 
 
 def _angle(text: str) -> float | tuple[float, float]:

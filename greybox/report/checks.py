@@ -31,7 +31,8 @@ from greybox.report.check_rows import (
 from greybox.report.check_ties import make_tie, tie_figure
 from greybox.report.figures import to_svg
 from greybox.report.log import facts, page_figures
-from greybox.report.page import NextStep, Page, Picture, Section, Table, computed, typed, write_page
+from greybox.report.next_steps import after_check
+from greybox.report.page import Page, Picture, Section, Table, computed, write_page
 from greybox.report.thinning import points_for
 from greybox.trial.checks.finding import CheckReport, Finding, shared_findings, size_in_words
 from greybox.trial.convert.convert import import_recording
@@ -140,7 +141,7 @@ def check_page(
         headline=headline(reports),
         sections=sections,
         lead=lead,
-        next_steps=_next_steps(reports, record or {}),
+        next_steps=after_check(reports, record or {}),
         computed=made,
     )
     write_page(page, target)
@@ -185,29 +186,6 @@ def _apart(
     if len(reports) > 1 and reports[k].findings:
         first = replace(first, caption=f"{reports[k].name}: {first.caption}")
     return first, left
-
-
-def _next_steps(reports: Sequence[CheckReport], record: Mapping[str, Any]) -> list[NextStep]:
-    """Return what to do with the logs as they were found."""
-    logs, vessel = typed(record, "logs", "LOG…"), typed(record, "vessel", "V")
-    found = [f for r in reports for f in r.findings]
-    target = "mended.csv" if len(reports) == 1 else "mended"
-    mend = f"greybox import {logs} --vessel {vessel} --out {target} --fix"
-    steps = []
-    if any(f.safe for f in found):
-        steps.append(NextStep("Mend what needs no judgement", mend))
-    judged = dict.fromkeys(f.id for f in found if f.repair and not f.safe)
-    if judged:
-        also = " ".join(f"--fix-also {i}" for i in judged)
-        steps.append(NextStep("Mend these too where their pictures convince you", f"{mend} {also}"))
-    if not steps:
-        steps.append(
-            NextStep(
-                "Estimate a model",
-                f"greybox estimate {logs} --vessel {vessel} --out model.json --report model.html",
-            )
-        )
-    return steps
 
 
 def finding_figure(finding: Finding, report: CheckReport, vessel: Vessel) -> Figure:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,8 @@ import numpy as np
 from greybox.model.model import ManoeuvringModel
 from greybox.report.chart import chart_of
 from greybox.report.figures import comparison_figure, to_svg
-from greybox.report.page import NextStep, Page, Picture, Table, computed, typed
+from greybox.report.next_steps import after_comparison
+from greybox.report.page import Page, Picture, Table, computed
 from greybox.report.thinning import points_for
 from greybox.validation.bands import LEVEL
 from greybox.validation.comparison import Comparison, rmse_titles
@@ -24,7 +24,7 @@ MOST_LOGS = 8
 
 def headline(comparison: Comparison) -> str:
     """Return one sentence on which model fits best and how well."""
-    fits, best = comparison.fits(), _best(comparison)
+    fits, best = comparison.fits(), comparison.best()
     shown = ", ".join(f"{_NAMES.get(s, s)} {v:.0f} %" for s, v in fits[best].items())
     count = len(comparison.runs[0])
     logs = f"the {count} logs" if count > 1 else "the log"
@@ -33,11 +33,6 @@ def headline(comparison: Comparison) -> str:
         f"The free run of model '{comparison.names[best]}' fits {logs}{most}: {shown} "
         f"(100 is perfect)."
     )
-
-
-def _best(comparison: Comparison) -> int:
-    """Return which model fits best, by the mean over the channels."""
-    return int(np.argmax([mean_fit(fit) for fit in comparison.fits()]))
 
 
 def comparison_page(
@@ -123,7 +118,7 @@ def comparison_page(
         ],
         pictures=pictures,
         lead=lead,
-        next_steps=[_next_step(comparison, models, record)],
+        next_steps=[after_comparison(comparison, models, record)],
         tables=tables,
         texts=[
             (f"Model {name}", model.summary())
@@ -135,7 +130,7 @@ def comparison_page(
 
 def _pictures(comparison: Comparison) -> list[Picture]:
     """Return one picture a log, as many as a page bears, the worst of the best model first."""
-    best = _best(comparison)
+    best = comparison.best()
     by_log = [mean_fit(run.fit) for run in comparison.runs[best]]
     worst = int(np.argmin(by_log))
     kept = [i for i, run in enumerate(comparison.runs[0]) if run.whole is None and i != worst]
@@ -177,21 +172,6 @@ def _pictures(comparison: Comparison) -> list[Picture]:
             )
         )
     return pictures
-
-
-def _next_step(
-    comparison: Comparison, models: Sequence[ManoeuvringModel], record: Mapping[str, Any]
-) -> NextStep:
-    """Return the command that tells why the best model errs where it does."""
-    given = record.get("command", {}).get("models", ())
-    best = _best(comparison)
-    model = shlex.quote(str(given[best])) if best < len(given) else "MODEL"
-    vessel = typed(models[best].record.get("provenance", {}), "vessel", "V")
-    return NextStep(
-        f"Find what '{comparison.names[best]}' gets wrong in these logs, and why",
-        f"greybox diagnose {typed(record, 'log', 'LOG…')} --vessel {vessel} --model {model} "
-        f"--report diagnosis.html",
-    )
 
 
 def _left_out(comparison: Comparison) -> list[str]:

@@ -33,7 +33,8 @@ from greybox.report.model_difference import (
     marked_equations,
     other_changes,
 )
-from greybox.report.page import NextStep, Page, Picture, Section, Table, computed
+from greybox.report.next_steps import NextStep
+from greybox.report.page import Page, Picture, Section, Table, computed
 from greybox.report.thinning import points_for
 
 _NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}

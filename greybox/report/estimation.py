@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.prediction_verdict import PredictionLevel
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.summary import (
@@ -23,8 +22,6 @@ from greybox.estimation.tried import Comparison
 from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult, TrustLevel
 from greybox.model.terms import parameter_unit
-from greybox.prediction.helm import find_helm
-from greybox.prediction.steady import kept_from_straight
 from greybox.report.chart import chart_of
 from greybox.report.estimation_figures import (
     MOST_DRAWN,
@@ -39,7 +36,8 @@ from greybox.report.estimation_figures import (
 )
 from greybox.report.figures import comparison_figure, to_svg
 from greybox.report.model_difference import shown_unit
-from greybox.report.page import NextStep, Page, Picture, Section, Table, computed, typed
+from greybox.report.next_steps import after_estimate
+from greybox.report.page import Page, Picture, Section, Table, computed
 from greybox.report.physical import physical_summary
 from greybox.report.thinning import points_for
 from greybox.selection.structures import StructureChoice
@@ -95,7 +93,7 @@ def estimation_page(
         tables=_prediction(estimate),
         sections=[s for s in sections if s is not None],
         lead=lead,
-        next_steps=_next_steps(estimate, record),
+        next_steps=after_estimate(estimate, record),
         computed=computed(dict(record))
         | {
             "standard errors": f"{estimate.covariance_kind}, residuals remembered over "
@@ -123,48 +121,6 @@ def headline(estimate: Estimate) -> str:
         for s, v in estimate.fit.items()
     )
     return f"{told}. Its free run fits the logs it was estimated on by {fit} (100 is perfect)."
-
-
-def _next_steps(estimate: Estimate, record: Mapping[str, Any]) -> list[NextStep]:
-    """Return what the verdicts ask for next."""
-    vessel, model = typed(record, "vessel", "V"), typed(record, "out", "MODEL")
-    logs, validate = typed(record, "logs", "LOG…"), typed(record, "validate", "")
-    level = estimate.prediction.level if estimate.prediction else PredictionLevel.NOT_JUDGED
-    trust = estimate.meant.verdict.level
-    steps = []
-    if level in (PredictionLevel.LIMITED, PredictionLevel.POOR) or trust is TrustLevel.DO_NOT_TRUST:
-        held = f" --validate {validate}" if validate else ""
-        steps.append(
-            NextStep(
-                "Find what the simulation gets wrong, and why",
-                f"greybox diagnose {logs} --vessel {vessel}{held} --report diagnosis.html",
-            )
-        )
-    helm = find_helm(estimate.vessel)
-    if level is PredictionLevel.GOOD and helm.kind != "none":
-        free = " --no-limits" if kept_from_straight(helm) else ""
-        steps.append(
-            NextStep(
-                "Predict manoeuvres of the ship",
-                f"greybox predict {model} zigzag{free} --report zigzag.html",
-            )
-        )
-    if level is PredictionLevel.NOT_JUDGED:
-        steps.append(
-            NextStep(
-                "See how well it predicts a log that it was not estimated on",
-                f"greybox compare {model} --log LOG --report compare.html",
-            )
-        )
-    if trust is TrustLevel.TRUST_EXCEPT:
-        steps.append(
-            NextStep(
-                "Plan a trial that narrows the intervals of the coefficients",
-                f"greybox design --vessel {vessel} --model {model} --for coefficients "
-                f"--duration 900 --out plan.csv",
-            )
-        )
-    return steps
 
 
 def _prediction(estimate: Estimate) -> list[Table]:

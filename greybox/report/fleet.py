@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,7 +14,8 @@ from greybox.fleet.pooling import LEVEL
 from greybox.fleet.trend import Trend
 from greybox.report.chart import chart_of
 from greybox.report.figures import BLACK, BLUE, VERMILION, new_figure, shorten, tidy, to_svg
-from greybox.report.page import NextStep, Page, Picture, Section, Table, computed, typed
+from greybox.report.next_steps import after_fleet
+from greybox.report.page import Page, Picture, Section, Table, computed
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ def fleet_page(fleet: Fleet, record: Mapping[str, Any]) -> Page:
             *(_capital(one.sentence) for one in fleet.left_out),
         ],
         lead=_map(fleet),
-        next_steps=_next_steps(fleet, record),
+        next_steps=after_fleet(fleet, record),
         sections=[s for s in sections if s is not None],
         computed=computed(dict(record)),
     )
@@ -57,49 +57,6 @@ def fleet_page(fleet: Fleet, record: Mapping[str, Any]) -> Page:
 
 def _capital(sentence: str) -> str:
     return sentence[:1].upper() + sentence[1:]
-
-
-def _next_steps(fleet: Fleet, record: Mapping[str, Any]) -> list[NextStep]:
-    """Return what the verdict asks for next."""
-    folder = typed(record, "fleet", "DIR")
-
-    def files(ship: str) -> str:
-        # quoted but for the star, which the shell expands
-        place = f"{folder}/{shlex.quote(ship)}"
-        return f"{place}/*.csv --vessel {place}/*.toml"
-
-    odd = [fleet.ships[c.unit].name for c in fleet.differing]
-    changing = list(dict.fromkeys(c.ship for c in fleet.changes()))
-    steps = [
-        NextStep(
-            f"See whether sensors or the vessel file make '{ship}' differ",
-            f"greybox check {files(ship)} --report check.html",
-        )
-        for ship in odd[:1]
-    ]
-    steps += [
-        NextStep(
-            f"See whether a sensor of '{ship}' changed, before hull or propeller are blamed",
-            f"greybox check {files(ship)} --report check.html",
-        )
-        for ship in changing[:1]
-        if ship not in odd
-    ]
-    steps += [
-        NextStep(
-            f"See what is wrong with the logs of '{one.ship}', which was left out",
-            f"greybox check {files(one.ship)} --report check.html",
-        )
-        for one in fleet.left_out[:1]
-    ]
-    first = (odd or [fleet.ships[0].name])[0]
-    steps.append(
-        NextStep(
-            f"See how far to trust the model of '{first}' alone",
-            f"greybox estimate {files(first)} --report {shlex.quote(first)}.html",
-        )
-    )
-    return steps
 
 
 def _deviations(fleet: Fleet) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from greybox.files import write_text
+from greybox.report.next_steps import NextStep
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -66,14 +66,6 @@ class Section:
     texts: Sequence[tuple[str, str]] = ()
     points: Sequence[str] = ()
     marked: Sequence[Marked] = ()
-    command: str = ""
-
-
-@dataclass(frozen=True)
-class NextStep:
-    """What to do next: what for, and the command for it, if there is one."""
-
-    purpose: str
     command: str = ""
 
 
@@ -307,8 +299,6 @@ def write_page(page: Page, path: str | Path) -> None:
     write_text(render(page), path)
 
 
-# files that a command line is still read with
-_MOST_TYPED = 3
 _MACHINES = ("program", "versions", "command", "line", "inputs", "logs", "validate")
 
 
@@ -330,25 +320,6 @@ def computed(record: Mapping[str, Any]) -> dict[str, str]:
     made = ", ".join(f"{n} {v}" for n, v in record["versions"].items())
     rows["computed with"] = f"{record['program']}, {made}"
     return rows | flatten({k: v for k, v in record.items() if k not in _MACHINES})
-
-
-def typed(record: Mapping[str, Any], option: str, stand_in: str) -> str:
-    """Return what a command was given for an option, as it is typed in the next one.
-
-    Parameters
-    ----------
-    record : mapping
-        As a command records it.
-    option : str
-        Its name in ``record["command"]``.
-    stand_in : str
-        What stands for it where it was not given, or where it is a long list.
-    """
-    given = record.get("command", {}).get(option)
-    several = [str(g) for g in (given if isinstance(given, (list, tuple)) else [given]) if g]
-    if not 0 < len(several) <= _MOST_TYPED or "-" in several:
-        return stand_in
-    return shlex.join(several)
 
 
 def flatten(record: dict[str, Any]) -> dict[str, str]:

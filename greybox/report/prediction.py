@@ -20,7 +20,8 @@ from greybox.prediction.result import (
     verdict_line,
 )
 from greybox.report.figures import BLACK, BLUE, VERMILION, new_figure, tidy, to_svg
-from greybox.report.page import NextStep, Page, Picture, Section, Table, flatten, typed
+from greybox.report.next_steps import after_prediction
+from greybox.report.page import Page, Picture, Section, Table, flatten
 from greybox.trial.manoeuvres import Compliance
 
 Array = NDArray[np.float64]
@@ -54,39 +55,9 @@ def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any], vessel: s
               if made.notes else []),
         ],
         lead=replace(lead, caption=f"{sections[0].title}: {lead.caption}"),
-        next_steps=_next_steps(made, record, vessel),
+        next_steps=after_prediction(made, record, vessel),
         computed=flatten(record),
     )  # fmt: skip
-
-
-def _next_steps(made: ManoeuvrePrediction, record: dict[str, Any], vessel: str) -> list[NextStep]:
-    """Return what makes the prediction surer, or puts it to the test."""
-    model = typed(record, "model", "MODEL")
-    agreements = [m.agreement for m in made.manoeuvres if m.agreement is not None]
-    steps = []
-    if any(c.verdict is Compliance.OPEN for m in made.manoeuvres for c in m.criteria):
-        steps.append(
-            NextStep(
-                "Plan a trial that narrows these intervals",
-                f"greybox design --vessel {vessel} --model {model} --duration 900 --out plan.csv",
-            )
-        )
-    if made.prediction in _DOUBTS or not all(r.agrees for a in agreements for r in a.rows):
-        steps.append(
-            NextStep(
-                "Find what the model gets wrong, and why",
-                f"greybox diagnose {typed(record, 'trial', 'LOG')} --vessel {vessel} "
-                f"--model {model} --report diagnosis.html",
-            )
-        )
-    if not agreements:
-        steps.append(
-            NextStep(
-                "Compare it with the manoeuvre once that has been sailed",
-                f"greybox predict {model} {made.kind} --trial LOG --report beside.html",
-            )
-        )
-    return steps
 
 
 def headline(made: ManoeuvrePrediction) -> str:

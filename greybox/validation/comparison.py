@@ -104,6 +104,10 @@ class Comparison(DisplayMixin):
             {s: float(np.mean([r.fit[s] for r in row])) for s in row[0].fit} for row in self.runs
         ]
 
+    def best(self) -> int:
+        """Return which model fits best, by the mean over the channels."""
+        return int(np.argmax([mean_fit(fit) for fit in self.fits()]))
+
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison for JSON."""
         return {

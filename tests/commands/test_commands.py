@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -18,7 +19,7 @@ from virtual import recorded, virtual_log, write_csv
 
 from greybox.commands.diagnose import _with_files
 from greybox.commands.main import main
-from greybox.report.comparison import _next_step
+from greybox.report.next_steps import after_comparison
 from greybox.trial.log import make_log
 from greybox.vessel.toml import load_vessel
 
@@ -280,12 +281,29 @@ def test_next_steps_name_the_files_of_the_user():
     assert "--model runs/better.json " in filled[1]
     assert len(filled) == 2
     model = SimpleNamespace(record={"provenance": record})
-    best = SimpleNamespace(names=["mine"], fits=lambda: [{"u": 80.0}])
-    step = _next_step(best, [model], {"command": {"models": ["mine.json"], "log": ["day 2.csv"]}})
+    best = SimpleNamespace(names=["mine"], best=lambda: 0)
+    step = after_comparison(
+        best, [model], {"command": {"models": ["mine.json"], "log": ["day 2.csv"]}}
+    )
     assert step.command == (
         "greybox diagnose 'day 2.csv' --vessel 'my ship.toml' --model mine.json "
         "--report diagnosis.html"
     )
+
+
+def test_what_is_told_to_do_next_can_be_typed_as_it_stands(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_csv(virtual_log(2, 600), Path("my raw.csv"))
+    command = ["greybox", "import", "my raw.csv", "--vessel", "thesis", "--out", "my log.csv"]
+    walked = []
+    while len(walked) < 3:
+        walked.append(command[1])
+        assert run(*command[1:], *(LEAST if command[1] == "estimate" else ())) == 0
+        steps = [s for s in capsys.readouterr().out.splitlines() if s.startswith("next: ")]
+        command = shlex.split(steps[0].split(": ")[-1])
+    assert walked == ["import", "check", "estimate"]
+    assert command[0] == "greybox"
+    assert Path("check.html").exists()
 
 
 def test_an_error_about_a_raw_file_tells_the_whole_command(tmp_path, capsys, monkeypatch):

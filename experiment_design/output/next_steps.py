@@ -1,0 +1,42 @@
+"""What to do with a plan, as its page and the terminal tell it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from greybox.report.next_steps import NextStep, typed
+
+
+def after_design(record: Mapping[str, Any], judged: bool) -> list[NextStep]:
+    """Return what to do once the plan has been sailed.
+
+    Parameters
+    ----------
+    record : mapping
+        As the command records it.
+    judged : bool
+        Whether the plan has a part to judge the estimate by.
+    """
+    vessel, given = typed(record, "vessel", "V"), record.get("command", {})
+    check = NextStep(
+        "Sail the plan, and check its log before you leave the area",
+        f"greybox check LOG --vessel {vessel} --report check.html",
+    )
+    explain = any(map(given.get, ("between", "causes", "diagnosis")))
+    if explain or given.get("purpose") == "causes":
+        return [
+            check,
+            NextStep(
+                "See which of the explanations the log supports",
+                f"greybox diagnose LOG --vessel {vessel} --report diagnosis.html",
+            ),
+        ]
+    part = f" --plan {typed(record, 'out', 'PLAN')}" if judged else ""
+    return [
+        check,
+        NextStep(
+            "Estimate the model from it",
+            f"greybox estimate LOG --vessel {vessel}{part} --out model.json --report model.html",
+        ),
+    ]

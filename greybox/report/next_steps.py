@@ -1,0 +1,223 @@
+"""What to do after a command, as its page and the terminal tell it."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from greybox.estimation.prediction_verdict import PredictionLevel
+from greybox.estimation.verdict import TrustLevel
+
+if TYPE_CHECKING:
+    from greybox.estimation.result import Estimate
+    from greybox.fleet.fleet import Fleet
+    from greybox.model.model import ManoeuvringModel
+    from greybox.prediction.result import ManoeuvrePrediction
+    from greybox.trial.checks.finding import CheckReport
+    from greybox.validation.comparison import Comparison
+
+# files that a command line is still read with
+_MOST_TYPED = 3
+_DOUBTED = (PredictionLevel.LIMITED, PredictionLevel.POOR)
+
+
+@dataclass(frozen=True)
+class NextStep:
+    """What to do next: what for, and the command for it, if there is one."""
+
+    purpose: str
+    command: str = ""
+
+    def line(self) -> str:
+        """Return it as the terminal shows it."""
+        told = self.purpose[:1].lower() + self.purpose[1:]
+        return f"next: {told}{': ' * bool(self.command)}{self.command}"
+
+
+def typed(record: Mapping[str, Any], option: str, stand_in: str) -> str:
+    """Return what a command was given for an option, as it is typed in the next one.
+
+    Parameters
+    ----------
+    record : mapping
+        As a command records it.
+    option : str
+        Its name in ``record["command"]``.
+    stand_in : str
+        What stands for it where it was not given, or where it is a long list.
+    """
+    given = record.get("command", {}).get(option)
+    several = [str(g) for g in (given if isinstance(given, (list, tuple)) else [given]) if g]
+    if not 0 < len(several) <= _MOST_TYPED or "-" in several:
+        return stand_in
+    return shlex.join(several)
+
+
+def after_import(out: str, vessel: str) -> NextStep:
+    """Return what to do with the log, or the folder of logs, that was written."""
+    return NextStep(
+        "See whether sensors and the vessel file are right",
+        f"greybox check {shlex.quote(out)} --vessel {shlex.quote(vessel)} --report check.html",
+    )
+
+
+def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextStep]:
+    """Return what the verdicts ask for next."""
+    vessel, model = typed(record, "vessel", "V"), typed(record, "out", "MODEL")
+    logs, validate = typed(record, "logs", "LOG…"), typed(record, "validate", "")
+    level = estimate.prediction.level if estimate.prediction else PredictionLevel.NOT_JUDGED
+    trust = estimate.meant.verdict.level
+    steps = []
+    if level in _DOUBTED or trust is TrustLevel.DO_NOT_TRUST:
+        held = f" --validate {validate}" if validate else ""
+        steps.append(
+            NextStep(
+                "Find what the simulation gets wrong, and why",
+                f"greybox diagnose {logs} --vessel {vessel}{held} --report diagnosis.html",
+            )
+        )
+    from greybox.prediction.helm import find_helm
+    from greybox.prediction.steady import kept_from_straight
+
+    helm = find_helm(estimate.vessel)
+    if level is PredictionLevel.GOOD and helm.kind != "none":
+        free = " --no-limits" if kept_from_straight(helm) else ""
+        steps.append(
+            NextStep(
+                "Predict manoeuvres of the ship",
+                f"greybox predict {model} zigzag{free} --report zigzag.html",
+            )
+        )
+    if level is PredictionLevel.NOT_JUDGED:
+        steps.append(
+            NextStep(
+                "See how well it predicts a log that it was not estimated on",
+                f"greybox compare {model} --log LOG --report compare.html",
+            )
+        )
+    if trust is TrustLevel.TRUST_EXCEPT:
+        steps.append(
+            NextStep(
+                "Plan a trial that narrows the intervals of the coefficients",
+                f"greybox design --vessel {vessel} --model {model} --for coefficients "
+                f"--duration 900 --out plan.csv",
+            )
+        )
+    return steps
+
+
+def after_check(reports: Sequence[CheckReport], record: Mapping[str, Any]) -> list[NextStep]:
+    """Return what to do with the logs as they were found."""
+    logs, vessel = typed(record, "logs", "LOG…"), typed(record, "vessel", "V")
+    found = [f for r in reports for f in r.findings]
+    target = "mended.csv" if len(reports) == 1 else "mended"
+    mend = f"greybox import {logs} --vessel {vessel} --out {target} --fix"
+    steps = []
+    if any(f.safe for f in found):
+        steps.append(NextStep("Mend what needs no judgement", mend))
+    judged = dict.fromkeys(f.id for f in found if f.repair and not f.safe)
+    if judged:
+        also = " ".join(f"--fix-also {i}" for i in judged)
+        steps.append(NextStep("Mend these too where their pictures convince you", f"{mend} {also}"))
+    if not steps:
+        steps.append(
+            NextStep(
+                "Estimate a model",
+                f"greybox estimate {logs} --vessel {vessel} --out model.json --report model.html",
+            )
+        )
+    return steps
+
+
+def after_comparison(
+    comparison: Comparison, models: Sequence[ManoeuvringModel], record: Mapping[str, Any]
+) -> NextStep:
+    """Return the command that tells why the best model errs where it does."""
+    given = record.get("command", {}).get("models", ())
+    best = comparison.best()
+    model = shlex.quote(str(given[best])) if best < len(given) else "MODEL"
+    vessel = typed(models[best].record.get("provenance", {}), "vessel", "V")
+    return NextStep(
+        f"Find what '{comparison.names[best]}' gets wrong in these logs, and why",
+        f"greybox diagnose {typed(record, 'log', 'LOG…')} --vessel {vessel} --model {model} "
+        f"--report diagnosis.html",
+    )
+
+
+def after_prediction(
+    made: ManoeuvrePrediction, record: dict[str, Any], vessel: str
+) -> list[NextStep]:
+    """Return what makes the prediction surer, or puts it to the test."""
+    from greybox.trial.manoeuvres import Compliance
+
+    model = typed(record, "model", "MODEL")
+    agreements = [m.agreement for m in made.manoeuvres if m.agreement is not None]
+    steps = []
+    if any(c.verdict is Compliance.OPEN for m in made.manoeuvres for c in m.criteria):
+        steps.append(
+            NextStep(
+                "Plan a trial that narrows these intervals",
+                f"greybox design --vessel {vessel} --model {model} --duration 900 --out plan.csv",
+            )
+        )
+    if made.prediction in _DOUBTED or not all(r.agrees for a in agreements for r in a.rows):
+        steps.append(
+            NextStep(
+                "Find what the model gets wrong, and why",
+                f"greybox diagnose {typed(record, 'trial', 'LOG')} --vessel {vessel} "
+                f"--model {model} --report diagnosis.html",
+            )
+        )
+    if not agreements:
+        steps.append(
+            NextStep(
+                "Compare it with the manoeuvre once that has been sailed",
+                f"greybox predict {model} {made.kind} --trial LOG --report beside.html",
+            )
+        )
+    return steps
+
+
+def after_fleet(fleet: Fleet, record: Mapping[str, Any]) -> list[NextStep]:
+    """Return what the verdict asks for next."""
+    folder = typed(record, "fleet", "DIR")
+
+    def files(ship: str) -> str:
+        # quoted but for the star, which the shell expands
+        place = f"{folder}/{shlex.quote(ship)}"
+        return f"{place}/*.csv --vessel {place}/*.toml"
+
+    odd = [fleet.ships[c.unit].name for c in fleet.differing]
+    changing = list(dict.fromkeys(c.ship for c in fleet.changes()))
+    steps = [
+        NextStep(
+            f"See whether sensors or the vessel file make '{ship}' differ",
+            f"greybox check {files(ship)} --report check.html",
+        )
+        for ship in odd[:1]
+    ]
+    steps += [
+        NextStep(
+            f"See whether a sensor of '{ship}' changed, before hull or propeller are blamed",
+            f"greybox check {files(ship)} --report check.html",
+        )
+        for ship in changing[:1]
+        if ship not in odd
+    ]
+    steps += [
+        NextStep(
+            f"See what is wrong with the logs of '{one.ship}', which was left out",
+            f"greybox check {files(one.ship)} --report check.html",
+        )
+        for one in fleet.left_out[:1]
+    ]
+    first = (odd or [fleet.ships[0].name])[0]
+    steps.append(
+        NextStep(
+            f"See how far to trust the model of '{first}' alone",
+            f"greybox estimate {files(first)} --report {shlex.quote(first)}.html",
+        )
+    )
+    return steps
