@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -14,7 +14,7 @@ from greybox.diagnosis.black_box import with_remainder
 from greybox.diagnosis.builder import DiagnosisBuilder
 from greybox.diagnosis.chosen import choice_of, from_chosen
 from greybox.diagnosis.evidence.kinematics import causes_of, denied
-from greybox.diagnosis.preparing import SHORTEST, prepare
+from greybox.diagnosis.preparing import SHORTEST, prepare, with_own_sensors
 from greybox.diagnosis.result import Diagnosis
 from greybox.diagnosis.ruling import leaves_more
 from greybox.diagnosis.search import search, weighed
@@ -120,11 +120,16 @@ def diagnose(
     paced: list[str] = []
     if model is None and options.own_pace:
         logs, validate = _at_own_pace(logs, validate, paced)
-    ready = prepare(logs, validate, model, options.structure, options.causes)
-    case = ready.case
-    # most models turn out to need it, and not every search keeps all processors busy
-    begun = ahead(partial(choice_of, case.logs)) if model is None else nullcontext(lambda: None)
-    with begun as choice:
+    with ExitStack() as begun:
+        # most models turn out to need it, and not all before keeps all processors busy
+        terms = ahead(partial(choice_of, with_own_sensors(logs)))
+        choice = begun.enter_context(terms) if model is None else None
+        ready = prepare(logs, validate, model, options.structure, options.causes)
+        case = ready.case
+        if ready.findings and choice is not None:
+            # the checks mended the logs that it began with
+            begun.close()
+            choice = begun.enter_context(ahead(partial(choice_of, case.logs)))
         say("model without causes")
         base = ready.base()
         problem = case.problem(base.integrator)
@@ -145,7 +150,7 @@ def diagnose(
             found = weighed(case, searched)
             more = leaves_more(found, case.held_out)
         found = replace(found, given=ready.as_given())
-        if model is None and more:
+        if choice is not None and more:
             chosen = from_chosen(ready, searched, found, choice, say)
             if chosen is not None:
                 wider, mine = chosen

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.normal import bounded_step
-from greybox.numerics.recursion import filtered
+from greybox.numerics.recursion import filtered, recursive
 from greybox.numerics.robust import white_noise
 
 Array = NDArray[np.float64]
@@ -282,10 +282,7 @@ class Likelihood:
 
     def _past(self, series: Array, denominator: Array) -> Array:
         """Return series (k, logs, N) by 1/A as of 0 to n samples earlier, (k, n+1, samples)."""
-        from scipy.signal import lfilter
-
-        given = series.reshape(self._errors.shape)
-        made = lfilter([1.0], denominator, given)
+        made = recursive(denominator, series.reshape(self._errors.shape))
         out = np.zeros((self.k, len(denominator), *made.shape[1:]))
         for j in range(len(denominator)):
             out[:, j, :, j:] = made[:, :, : made.shape[2] - j]

@@ -152,6 +152,12 @@ def prepare(
     )
 
 
+def with_own_sensors(logs: Sequence[TrialLog]) -> list[TrialLog]:
+    """Return the logs that are long enough as `prepare` makes them where checks find nothing."""
+    kept = _long_enough(logs)
+    return [correct_log(log, kept[0].vessel) for log in kept]
+
+
 def _long_enough(logs: Sequence[TrialLog]) -> list[TrialLog]:
     kept = [log for log in logs if len(log) >= SHORTEST]
     if not kept:

@@ -345,7 +345,7 @@ def _wald_checked(case: DiagnosisProblem, candidate: Candidate) -> Candidate:
     by chance for more than χ²; where it fell because the fit without the cause had stopped
     early, the cause's numbers stand at their null. A number with many hills has no null.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     hypothesis, fit = candidate.hypothesis, candidate.fit
     problem = case.problem(fit.integrator)
@@ -363,7 +363,7 @@ def _wald_checked(case: DiagnosisProblem, candidate: Candidate) -> Candidate:
     own = covariance[np.ix_(where, where)]
     away = numbers[where] - null
     wald = float(away @ np.linalg.pinv(own) @ away) if np.isfinite(own).all() else 0.0
-    p = max(candidate.p_value, float(chi2.sf(wald, len(where))))
+    p = max(candidate.p_value, float(chdtrc(len(where), wald)))
     return replace(candidate, p_value=p, p_adjusted=min(1.0, p * candidate.tried))
 
 
@@ -417,11 +417,11 @@ def assess_candidate(
     names: tuple[str, ...] = (),
 ) -> Candidate:
     """Return a refitted cause with its significance, and what it does for held-out logs."""
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     gain = before.cost - fit.cost if np.isfinite(fit.cost) else -np.inf
     numbers = freed(before, fit, hypothesis)
-    p = float(chi2.sf(max(gain, 0.0), numbers))
+    p = float(chdtrc(numbers, max(gain, 0.0)))
     # the best of many moments is likelier than any one
     tried *= MOMENTS if any(parameter.reach > 0 for parameter in hypothesis.parameters) else 1
     return Candidate(hypothesis, fit, gain, p, min(1.0, p * tried), proof, names, tried, numbers)

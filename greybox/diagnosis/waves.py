@@ -66,7 +66,7 @@ def find_waves(
         [s]
     """
     from scipy.ndimage import median_filter
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     use = [i for i, n in enumerate(names) if n != "psi"]
     frequency, power, count = _spectrum([n[:, use] for n in nu], sample_time)
@@ -80,7 +80,7 @@ def find_waves(
     ratio = np.where(inside, together / np.maximum(background, 1e-300), 0.0)
     k = int(np.argmax(ratio))
     freedom = 2 * count * len(use)
-    p = min(1.0, float(chi2.sf(ratio[k] * freedom, freedom)) * int(inside.sum()))
+    p = min(1.0, float(chdtrc(freedom, ratio[k] * freedom)) * int(inside.sum()))
     near = np.abs(frequency - frequency[k]) < _NARROW * frequency[k]
     # a hump as wide as the band is no sea
     wide = (ratio > 0.5 * ratio[k]) & inside & ~near

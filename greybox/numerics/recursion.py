@@ -2,8 +2,8 @@
 
 S(k+1) = A(k) S(k) + B(k) is three loops of C where there is a compiler. Elsewhere it is linear in
 S(0): stretches of samples are followed side by side from nothing, and what each begins with is
-added afterwards. With few columns the recursion is one banded triangular system in all samples,
-which a library solves sooner.
+added afterwards. With few columns, and for filters, the recursion is one banded triangular system
+in all samples, which a library solves sooner.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Sequence
-from functools import cache, lru_cache
-from typing import Any
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +25,6 @@ Array = NDArray[np.float64]
 _FEW = 8
 # from this many runs on a step of all of them together is work enough
 _MANY = 16
-# samples that a filter takes at once, and signals from which on that is the faster way
-_AT_ONCE, _SIGNALS = 32, 4
 
 
 _RECURSION = """
@@ -52,19 +49,54 @@ void greybox_recursion(long long runs, long long steps, long long n, long long m
 """
 
 
-_LIBRARY = Library(
-    lambda: SHOWN + _RECURSION,
-    "greybox_recursion",
-    [ctypes.c_longlong] * 4 + [ctypes.c_void_p] * 3,
-    _RECURSION,
-)
+_PUSHED = """
+__attribute__((optimize("O3")))
+void greybox_pushed(long long rows, long long samples, long long taps,
+                    const double* restrict b, const double* restrict e, double* restrict y) {
+  long long row, k, d;
+  for (row = 0; row < rows; row++, e += samples, y += samples) {
+    for (d = 0; d < taps && d < samples; d++) {
+      const double share = b[d];
+      if (share != 0.0) for (k = d; k < samples; k++) y[k] += share * e[k - d];
+    }
+  }
+}
+"""
+_RECURSIVE = """
+void greybox_recursive(long long rows, long long samples, long long taps,
+                       const double* restrict a, double* restrict y) {
+  long long row, k, d;
+  for (row = 0; row < rows; row++, y += samples) {
+    for (k = 1; k < samples; k++) {
+      double value = y[k];
+      for (d = k < taps ? k : taps - 1; d > 0; d--) value -= a[d] * y[k - d];
+      y[k] = value;
+    }
+  }
+}
+"""
+
+
+_SOURCES = {
+    name: Library(
+        lambda source=source: SHOWN + source,  # type: ignore[misc]
+        name,
+        [ctypes.c_longlong] * whole + [ctypes.c_void_p] * arrays,
+        source,
+    )
+    for name, source, whole, arrays in (
+        ("greybox_recursion", _RECURSION, 4, 3),
+        ("greybox_pushed", _PUSHED, 3, 3),
+        ("greybox_recursive", _RECURSIVE, 3, 2),
+    )
+}
 
 
 @cache
-def _compiled() -> Callable[..., None] | None:
-    """Return the recursion as machine code; None where there is no compiler."""
+def _compiled(name: str) -> Callable[..., None] | None:
+    """Return a recursion as machine code; None where there is no compiler."""
     # compiled at the first call, however short: the same command gives the same digits each time
-    return _LIBRARY.found() or _LIBRARY.made()
+    return _SOURCES[name].found() or _SOURCES[name].made()
 
 
 def propagate(a: Array, b: Array, start: Array) -> Array:
@@ -87,7 +119,7 @@ def propagate(a: Array, b: Array, start: Array) -> Array:
     lead, (steps, n, columns) = b.shape[:-3], b.shape[-3:]
     runs = math.prod(lead)
     a, b = a.reshape(runs, steps, n, n), b.reshape(runs, steps, n, columns)
-    in_c = _compiled()
+    in_c = _compiled("greybox_recursion")
     out = np.empty((steps + 1, runs, n, columns)) if runs >= _MANY and in_c is None else None
     found = np.empty((runs, steps + 1, n, columns)) if out is None else out.swapaxes(0, 1)
     found[:, 0] = start.reshape(runs, n, columns)
@@ -109,12 +141,36 @@ def propagate(a: Array, b: Array, start: Array) -> Array:
     return found.reshape(*lead, steps + 1, n, columns)
 
 
+def recursive(denominator: Array, rows: Array) -> Array:
+    """Return y with A(q⁻¹) y = rows, from rest.
+
+    Parameters
+    ----------
+    denominator : ndarray
+        (n+1,) A in powers of the delay, its first coefficient 1.
+    rows : ndarray
+        (..., N), time last.
+    """
+    return _recursive(denominator, np.array(rows, float, order="C"))
+
+
+def _recursive(denominator: Array, y: Array) -> Array:
+    """Fill in place what `recursive` returns."""
+    if not y.size:
+        return y
+    a, samples = np.ascontiguousarray(denominator, float), y.shape[-1]
+    in_c = _compiled("greybox_recursive")
+    if in_c is not None:
+        in_c(y.size // samples, samples, len(a), a.ctypes.data, y.ctypes.data)
+        return y
+    band = np.repeat(a[:samples, None], samples, axis=1)
+    solved, _ = dtbtrs(band, y.reshape(-1, samples).T, uplo="L", diag="U", overwrite_b=True)
+    return np.asarray(solved.T.reshape(y.shape))
+
+
 def decay(share: float, b: Array) -> Array:
     """Return y with y(0) = b(0) and y(k+1) = share·y(k) + b(k+1), along axis 0 of b (N, …)."""
-    columns = np.array(b.reshape(len(b), -1), order="F")
-    band = np.vstack([np.ones(len(b)), np.full(len(b), -share)])
-    solved, _ = dtbtrs(band, columns, uplo="L", diag="U", overwrite_b=True)
-    return np.asarray(solved.reshape(b.shape))
+    return np.moveaxis(recursive(np.array([1.0, -share]), np.moveaxis(b, 0, -1)), -1, 0)
 
 
 def filtered(numerators: Array, denominator: Array, channels: Sequence[Array]) -> list[Array]:
@@ -134,105 +190,17 @@ def filtered(numerators: Array, denominator: Array, channels: Sequence[Array]) -
     list of ndarray
         (m, N) of each of the k outputs.
     """
-    signals, samples = channels[0].shape
-    if signals >= _SIGNALS and samples > _AT_ONCE:
-        with np.errstate(over="ignore", invalid="ignore"):
-            found = _by_blocks(numerators, denominator, channels)
-        # beyond the numbers' range a sample must not reach those before it
-        if all(np.isfinite(y[:, -1]).all() for y in found):
-            return found
-    from scipy.signal import lfilter
-
-    out = []
-    for row in numerators:
-        total = np.zeros((signals, samples))
-        for numerator, e in zip(row, channels, strict=True):
-            if numerator.any():
-                total += lfilter(numerator, denominator, e)
-        out.append(total)
-    return out
-
-
-def _by_blocks(numerators: Array, denominator: Array, channels: Sequence[Array]) -> list[Array]:
-    """Filter blocks of samples by matrix products; what a block leaves is carried to the next."""
-    (signals, samples), size = channels[0].shape, len(denominator) - 1
-    blocks = -(-samples // _AT_ONCE)
-    own, entering, leaving, carried = _block_matrices(
-        numerators.tobytes(), denominator.tobytes(), len(channels)
-    )
-    given = []
-    for e in channels:
-        padded = np.zeros((signals, blocks * _AT_ONCE))
-        padded[:, :samples] = e
-        given.append(padded.reshape(-1, _AT_ONCE))
-    y = np.zeros((len(given), *given[0].shape))
-    left = np.zeros((len(given), len(given[0]), size))
+    pushed = np.zeros((len(numerators), *channels[0].shape))
+    in_c = _compiled("greybox_pushed")
     for i, j in zip(*np.nonzero(numerators.any(axis=2)), strict=True):
-        y[i] += given[j] @ own[i, j]
-        left[i] += given[j] @ leaving[i, j]
-    rows = left.reshape(-1, blocks, size)
-    pushed = np.ascontiguousarray(rows.swapaxes(0, 1))
-    state = np.zeros_like(pushed)
-    for k in range(blocks - 1):
-        np.dot(state[k], carried, out=state[k + 1])
-        state[k + 1] += pushed[k]
-    y += (state.swapaxes(0, 1).reshape(-1, size) @ entering).reshape(y.shape)
-    return [one.reshape(signals, -1)[:, :samples] for one in y]
-
-
-@lru_cache(maxsize=64)
-def _block_matrices(
-    numerators: bytes, denominator: bytes, channels: int
-) -> tuple[Array, Array, Array, Array]:
-    """Return what acts on rows of a block's samples and on rows of the state that it begins with.
-
-    ``own`` (k, k, L, L) from samples to outputs, ``entering`` (n, L) from the state to outputs,
-    ``leaving`` (k, k, L, n) from samples to the state after the block, ``carried`` (n, n) from the
-    state to that state. The state is that of the transposed direct form, turned so that it is as
-    large as what it leads to: near a pole of one the other cancels digits.
-    """
-    a = np.frombuffer(denominator).astype(np.longdouble)
-    b = np.frombuffer(numerators).astype(np.longdouble).reshape(channels, channels, len(a))
-    size = len(a) - 1
-    step = np.eye(size, k=1, dtype=np.longdouble)
-    step[:, 0] -= a[1:]
-    first = b[:, :, 1:] - b[:, :, :1] * a[1:]
-    entering = np.empty((size, _AT_ONCE), np.longdouble)
-    leaving = np.empty((*b.shape[:2], _AT_ONCE, size), np.longdouble)
-    power = np.eye(size, dtype=np.longdouble)
-    for k in range(_AT_ONCE):
-        entering[:, k] = power[0]
-        leaving[:, :, _AT_ONCE - 1 - k] = first @ power.T
-        power = step @ power
-    # of an impulse, by how many samples it is ago
-    response = np.concatenate([b[:, :, :1], first @ entering[:, :-1]], axis=2)
-    ago = np.arange(_AT_ONCE) - np.arange(_AT_ONCE)[:, None]
-    own = np.where(ago >= 0, response[:, :, np.maximum(ago, 0)], 0.0)
-    entering, turn = _orthonormal(entering)
-    carried = power.T @ turn
-    for i in range(size):
-        carried[i] = (carried[i] - turn[i, :i] @ carried[:i]) / turn[i, i]
-    return (
-        own.astype(float),
-        entering.astype(float),
-        (leaving @ turn).astype(float),
-        carried.astype(float),
-    )
-
-
-def _orthonormal(rows: NDArray[np.longdouble]) -> tuple[Any, Any]:
-    """Return Q (n, L) with orthonormal rows and T (n, n), lower triangular, of rows T Q."""
-    q, turn = rows.copy(), np.zeros((len(rows),) * 2, np.longdouble)
-    for i in range(len(q)):
-        # what rounding leaves of the first subtraction goes with the second
-        for j in [*range(i), *range(i)]:
-            along = q[i] @ q[j]
-            turn[i, j] += along
-            q[i] -= along * q[j]
-        size = np.sqrt(q[i] @ q[i])
-        turn[i, i] = size if size > 0 else 1.0
-        q[i] /= turn[i, i]
-    return q, turn
+        shares, y, e = numerators[i, j], pushed[i], np.ascontiguousarray(channels[j], float)
+        if in_c is not None:
+            shares = np.ascontiguousarray(shares, float)
+            in_c(*y.shape, len(shares), *(x.ctypes.data for x in (shares, e, y)))
+            continue
+        for ago in np.flatnonzero(shares[: y.shape[1]]):
+            y[:, ago:] += shares[ago] * e[:, : y.shape[1] - ago]
+    return list(_recursive(denominator, pushed))
 
 
 def _stepped(a: Array, b: Array, out: Array) -> None:

@@ -17,6 +17,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.model.run.inputs import LogInputs
 from greybox.model.run.simulation import simulate
 from greybox.numerics.linalg import scaled_root
+from greybox.numerics.recursion import recursive
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import split_segments
@@ -354,10 +355,8 @@ def process_noise(
     rng: np.random.Generator, state: Array, memory: Array, drive: Array, steps: int
 ) -> tuple[Array, Array]:
     """Draw process noise (R, n, nx) that continues from `state` (R, nx), and its last value."""
-    from scipy.signal import lfilter
-
     out = drive * rng.standard_normal((len(state), steps, len(memory)))
     for i in np.flatnonzero(memory):
-        start = (memory[i] * state[:, i])[:, None]
-        out[:, :, i] = lfilter([1.0], [1.0, -memory[i]], out[:, :, i], axis=1, zi=start)[0]
+        out[:, :1, i] += (memory[i] * state[:, i])[:, None]
+        out[:, :, i] = recursive(np.array([1.0, -memory[i]]), out[:, :, i])
     return out, out[:, -1]

@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.recursion import recursive
 from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Actuation, LagHeld, Vessel
 
@@ -120,13 +121,12 @@ def lagged(value: Array, samples: float, held: LagHeld = "start") -> Array:
 
     Of each sample the value at its start, its mean over the sample, or that at its end.
     """
-    from scipy.signal import lfilter
-
     value = np.asarray(value, float)
     if samples == 0:
         return value
     a = decay(samples)
-    out, _ = lfilter([0.0, 1.0 - a], [1.0, -a], value, axis=-1, zi=value[..., :1])
+    pushed = np.concatenate([value[..., :1], (1.0 - a) * value[..., :-1]], axis=-1)
+    out = recursive(np.array([1.0, -a]), pushed)
     return np.asarray(value + (out - value) * held_share(samples, held))
 
 

@@ -12,7 +12,7 @@ from greybox.numerics.recursion import filtered, propagate
 def way(request, monkeypatch):
     """Each way to compute the same."""
     if request.param == "no compiler":
-        monkeypatch.setattr(recursion, "_compiled", lambda: None)
+        monkeypatch.setattr(recursion, "_compiled", lambda name: None)
 
 
 def looped(a, b, start):

@@ -124,7 +124,7 @@ class HeldOut(ABC):
 
 def proof_of(difference: Array) -> Proof:
     """Return the proof that differences of each sample (N,) give."""
-    from scipy.stats import t
+    from scipy.special import stdtr
 
     if not np.isfinite(difference).all():
         # one of the two runs away: no sum tells more than which
@@ -133,7 +133,7 @@ def proof_of(difference: Array) -> Proof:
     gain = float(difference.sum())
     std = float(np.sqrt(long_run_variance(difference) * len(difference)))
     blocks = len(difference) // _block(difference)
-    p = float(t.sf(gain / std, max(blocks - 1, 1))) if std > 0 else float(gain <= 0)
+    p = float(stdtr(max(blocks - 1, 1), -gain / std)) if std > 0 else float(gain <= 0)
     return Proof(gain, std, p, difference)
 
 

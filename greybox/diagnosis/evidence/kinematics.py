@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from greybox.channels import CHANNELS
 from greybox.diagnosis.causes import Cause
@@ -126,7 +126,7 @@ def found_by_checks(finding: Finding, cause: Cause, tried: int) -> Found:
         std = max((ci[1] - ci[0]) / (2 * _HALF), 1e-12)
         parameters[name] = Quantity(float(value), float(std), finding.unit)
         z = max(z, abs(value) / std)
-    p = float(2 * norm.sf(min(z, 37.0)))
+    p = float(2 * ndtr(-min(z, 37.0)))
     # of two late clocks, or reversed channels, each has its place
     place = () if finding.id in _NAMES else channels
     key = ":".join([finding.id, *place, "kinematics"])

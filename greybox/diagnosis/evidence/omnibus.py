@@ -90,7 +90,7 @@ def disagreement(pairs: Sequence[Pair]) -> Disagreement:
     ----------
     Wald (1943); Chow (1960) for regressions.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     fall, distance, count = 0.0, 0.0, 0
     for pair in pairs:
@@ -115,4 +115,4 @@ def disagreement(pairs: Sequence[Pair]) -> Disagreement:
             continue
         away = after - before
         distance += float(away @ scaled_inverse(spread, 1e-10) @ away)
-    return Disagreement(fall, float(chi2.sf(min(distance, fall / 2), count)))
+    return Disagreement(fall, float(chdtrc(count, min(distance, fall / 2))))

@@ -121,7 +121,7 @@ def _moved(
     problem: Problem, hypothesis: Hypothesis, fit: Fit, pairs: Sequence[Pair]
 ) -> tuple[Array, float, float]:
     """Return how far a hypothesis's numbers move, and two p-values of their null."""
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     where = problem.numbers_of(fit.point, hypothesis)
     bounded = [p for p in pairs if not (p.fit.escaped or p.held_fit.escaped)]
@@ -145,9 +145,9 @@ def _moved(
     size = float(far @ inverse @ far)
     share = float(np.clip(-(away @ inverse @ far) / size, 0.0, 1.0)) if size > 0 else 0.0
     near = away + share * far
-    passed = float(chi2.sf(float(near @ inverse @ near), int(tested.sum())))
+    passed = float(chdtrc(int(tested.sum()), float(near @ inverse @ near)))
     told = away**2 / np.maximum(np.diag(own)[tested] + far**2 + scatter[tested] ** 2, 1e-300)
-    return np.hypot(moved, scatter), passed, float(chi2.sf(told.max(), 1))
+    return np.hypot(moved, scatter), passed, float(chdtrc(1, told.max()))
 
 
 def _scatter(pair: Pair, hypothesis: Hypothesis) -> Array:

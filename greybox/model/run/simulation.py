@@ -15,6 +15,7 @@ from greybox.model.run.kernels import MANY_RUNS, FreeRunKernel, FreeRunStep, Ove
 from greybox.model.run.step import Heading, Integrator, StepModel, held, integrated
 from greybox.model.structure import Structure
 from greybox.notebook import DisplayMixin, number, sparkline, table
+from greybox.numerics.recursion import recursive
 from greybox.rotation import body_to_ned
 
 Array = NDArray[np.float64]
@@ -327,15 +328,15 @@ def stationary_disturbance(
     ndarray
         (R, N, nd) [m/s].
     """
-    from scipy.signal import lfilter
-
     mean = np.asarray(mean, float)
     white = rng.standard_normal((runs, samples, mean.size))
     if correlation_time > 0:
         a = float(np.exp(-sample_time / correlation_time))
         gain = np.sqrt(1 - a**2)
         start = rng.standard_normal((runs, 1, mean.size)) * a
-        white = lfilter([gain], [1.0, -a], white, axis=1, zi=start)[0]
+        white *= gain
+        white[:, :1] += start
+        white = recursive(np.array([1.0, -a]), white.swapaxes(1, 2)).swapaxes(1, 2)
     return np.asarray(mean + np.asarray(std) * white)
 
 
