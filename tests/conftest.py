@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import time
 
 # two test processes on two cores: threads of BLAS would only wait for each other
 for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
@@ -25,6 +26,13 @@ def pytest_collection_finish():
     """Leave out what stays until the end, tests and libraries, whenever garbage is looked for."""
     gc.collect()
     gc.freeze()
+
+
+def pytest_runtest_setup(item):
+    """Leave out the long tests that a slow machine has no time for."""
+    until = os.environ.get("LONG_TESTS_UNTIL")
+    if until and item.get_closest_marker("long") and time.time() > float(until):
+        pytest.skip("no time was left for this long test")
 
 
 @pytest.fixture
