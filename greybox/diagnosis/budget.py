@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.evidence.held_out import Pair, change_scenarios
 from greybox.diagnosis.evidence.remainder import generic_force
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.gain import blocks
+from greybox.diagnosis.gain import block_sums, blocks
 from greybox.diagnosis.noise import Noise, fit_noise
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.result import BudgetPart
@@ -229,10 +229,10 @@ def error_budget(
     -------
     tuple of BudgetPart
         Shares of each state, before and after the causes are mended, both of the squared error
-        before, with 95 % intervals by a moving-block bootstrap of the samples (Künsch, 1989) in
-        which each cause's size varies by its standard error, and what the extended model leaves
-        beyond the sensors' noise goes with the error without the cause, or against it, as may
-        be; empty where a run leaves every bound.
+        before, with 95 % intervals by a circular block bootstrap of the samples (Politis and
+        Romano, 1992) in which each cause's size varies by its standard error, and what the
+        extended model leaves beyond the sensors' noise goes with the error without the cause, or
+        against it, as may be; empty where a run leaves every bound.
     """
     if not len(base) or any(p.fit.escaped or p.held_fit.escaped for p in final):
         return ()
@@ -263,7 +263,7 @@ def error_budget(
     rng = np.random.default_rng([seed, 11])
     starts, length = blocks(len(e0), problem.sample_time, _DRAWS, rng)
     wide = {c.id: 1 + c.relative * rng.standard_normal((_DRAWS, 1)) for c in causes}
-    whole, drawn_whole = (e0**2).sum(axis=0), _drawn(e0**2, starts, length)
+    whole, drawn_whole = (e0**2).sum(axis=0), block_sums(e0**2, starts, length)
     left = np.maximum((e1**2).sum(axis=0) - len(e0) * moments[SENSOR], 0.0)
     # the ship without the cause is known as well as the extended model follows it
     unsure = {
@@ -278,14 +278,14 @@ def error_budget(
     def shares(parts: dict[str, Array], of: Array) -> tuple[dict[str, Array], dict[str, Array]]:
         """Return the shares (nx,) and their draws (draws, nx) of parts of a squared error."""
         point = {name: part.sum(axis=0) / whole for name, part in parts.items()}
-        draws = {name: _drawn(part, starts, length) / drawn_whole for name, part in parts.items()}
+        draws = {n: block_sums(part, starts, length) / drawn_whole for n, part in parts.items()}
         for name in set(parts) & set(without):
             draws[name] = draws[name] * wide.get(name, 1.0) + unsure[name]
         for name, moment in moments.items():
             point[name] = len(e0) * moment / whole
             draws[name] = length_drawn * moment / drawn_whole
         point[REST] = of.sum(axis=0) / whole - sum(point.values())
-        draws[REST] = _drawn(of, starts, length) / drawn_whole - sum(draws.values())
+        draws[REST] = block_sums(of, starts, length) / drawn_whole - sum(draws.values())
         return point, draws
 
     told, drawn = shares(before, e0**2)
@@ -334,9 +334,3 @@ def _moments(
     line = np.array([0.0 if waves is None else waves.std.get(s, 0.0) ** 2 for s in names])
     line = np.minimum(line, mean - sensor)
     return {SENSOR: sensor, SLOW: np.where(slow, mean - sensor - line, 0.0), WAVES: line}
-
-
-def _drawn(values: Array, starts: NDArray[np.intp], length: int) -> Array:
-    """Return the sums (draws, nx) of blocks of values (N, nx)."""
-    sums = np.vstack([np.zeros(values.shape[1]), np.cumsum(values, axis=0)])
-    return np.asarray((sums[starts + length] - sums[starts]).sum(axis=1))

@@ -32,8 +32,8 @@ def gains(
 ) -> dict[str, Gain]:
     """Return the mean fit (6.12) before and after, by state.
 
-    The interval of the difference is by a moving-block bootstrap over the logs'
-    samples (Künsch, 1989).
+    The interval of the difference is by a circular block bootstrap over the logs'
+    samples (Politis and Romano, 1992).
 
     Parameters
     ----------
@@ -53,8 +53,7 @@ def gains(
             parts = [_squares(run, i, state, size) for run in (one, two)]
             start, length = blocks(size, sample_time, _DRAWS, rng)
             for k, (error, spread) in enumerate(parts):
-                sums = [(np.cumsum(np.concatenate([[0.0], v]))) for v in (error, spread)]
-                e, s = ((c[start + length] - c[start]).sum(axis=1) for c in sums)
+                e, s = (block_sums(v, start, length) for v in (error, spread))
                 draws[k] += _fit(e, s) / len(before)
                 point[k] += float(_fit(error.sum(), spread.sum())) / len(before)
         low, high = np.quantile(draws[1] - draws[0], [0.025, 0.975])
@@ -65,10 +64,21 @@ def gains(
 def blocks(
     size: int, sample_time: float, draws: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.intp], int]:
-    """Return where moving blocks of a bootstrap begin (draws, count), and their length."""
+    """Return where the blocks of a circular bootstrap begin (draws, count), and their length.
+
+    Each sample is drawn as often as any other: of blocks that may not reach over the end, few
+    would hold the first and the last samples.
+    """
     length = int(np.clip(_BLOCK / sample_time, 1, max(size // _LEAST_BLOCKS, 1)))
     count = -(-size // length)
-    return rng.integers(0, size - length + 1, (draws, count)), length
+    return rng.integers(0, size, (draws, count)), length
+
+
+def block_sums(values: Array, starts: NDArray[np.intp], length: int) -> Array:
+    """Return the sums (draws, ...) over blocks of values (N, ...), whose end the start follows."""
+    sums = np.zeros((len(values) + length + 1, *values.shape[1:]))
+    np.cumsum(np.concatenate([values, values[:length]]), axis=0, out=sums[1:])
+    return np.asarray((sums[starts + length] - sums[starts]).sum(axis=1))
 
 
 def _fit(error: Array | float, spread: Array | float) -> Array:

@@ -14,7 +14,7 @@ from schemas import schema
 from greybox.commands.main import main
 from greybox.diagnosis.builder import diverging
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
-from greybox.diagnosis.gain import gains, run_on
+from greybox.diagnosis.gain import block_sums, blocks, gains, run_on
 from greybox.errors import LogError, UsageError
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel, load_model
@@ -115,6 +115,23 @@ def test_gain_of_a_model_on_itself_is_nothing() -> None:
     for gain in gains([run], [run], 1.0, 0).values():
         assert gain.before == gain.after
         assert gain.ci == (0.0, 0.0)
+
+
+def test_a_block_bootstrap_draws_each_sample_as_often_as_any_other() -> None:
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal((50, 2))
+    starts, length = blocks(50, 10.0, 4000, rng)
+    drawn = block_sums(values, starts, length)
+    whole = np.array([values[(starts[3, :, None] + np.arange(length)) % 50].sum(axis=(0, 1))])
+    np.testing.assert_allclose(drawn[3], whole[0])
+    # its mean is that of the samples, ends and all, to within four of its standard errors
+    error = drawn.std(axis=0) / np.sqrt(len(drawn))
+    count = starts.shape[1] * length
+    assert (np.abs(drawn.mean(axis=0) - count * values.mean(axis=0)) < 4 * error).all()
+    first = np.zeros(50)
+    first[0] = 1.0
+    counted = block_sums(first, starts, length).mean()
+    assert counted == pytest.approx(count / 50, abs=4 * np.sqrt(count / 50 / len(drawn)))
 
 
 def test_a_covariance_whose_models_diverge_is_told() -> None:
