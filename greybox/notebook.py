@@ -71,6 +71,17 @@ def number(value: float | None, digits: int = 4) -> str:
     return f"{value:.{digits}g}"
 
 
+def with_error(value: float, std: float) -> str:
+    """Return a value with its standard error, both to the second digit of the latter."""
+    if not np.isfinite(std) or std <= 0:
+        return number(value)
+    last = int(np.floor(np.log10(std))) - 1
+    if -7 <= last <= 0 and abs(value) < 1e6:
+        return f"{value:.{-last}f} ± {std:.{-last}f}"
+    first = int(np.floor(np.log10(abs(value)))) if value else last + 1
+    return f"{value:.{max(first - last, 0)}e} ± {std:.1e}"
+
+
 def interval(value: float, std: float, digits: int = 3) -> str:
     """Return the 95 % interval of a normal estimate."""
     if not np.isfinite([value, std]).all():

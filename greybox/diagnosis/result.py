@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from greybox.estimation.verdict import TestResult
 from greybox.model.model import ManoeuvringModel
-from greybox.notebook import DisplayMixin, interval, items, number, table, text
+from greybox.notebook import DisplayMixin, interval, items, number, table, text, with_error
 from greybox.trial.log import TrialLog
 from greybox.trial.validity import ConditionDifference
 
@@ -392,7 +392,8 @@ class Diagnosis(DisplayMixin):
         lines += [f"  {s.sentence}" for s in self.wrong] or ["  nothing beyond noise"]
         lines += [f"  {t.sentence}" for t in self.residuals.get("before", ()) if not t.passed]
         for title, causes in (
-            ("Causes", self.causes), ("No better than a generic force", self.partial),
+            ("Causes (± one standard error)", self.causes),
+            ("No better than a generic force", self.partial),
             ("Each would explain it", self.candidates),
         ):  # fmt: skip
             if causes:
@@ -400,7 +401,7 @@ class Diagnosis(DisplayMixin):
             for c in causes:
                 lines.append(f"  {c.id}: {c.evidence}")
                 lines += [
-                    f"    {name:<22}{q.value:>12.5g} ± {q.std:.2g} {q.unit}"
+                    f"    {name:<22}{with_error(q.value, q.std):>24} {q.unit}"
                     for name, q in c.parameters.items()
                 ]
                 lines.append(

@@ -8,8 +8,9 @@ import numpy as np
 
 from greybox.diagnosis.causes import known_causes
 from greybox.diagnosis.result import Diagnosis, DiagnosisVerdict, Found
+from greybox.notebook import with_error
 from greybox.report.diagnosis_figures import narrow, ranked_for_picture, ranking_figure
-from greybox.report.model_difference import shown_unit, unbroken, with_error
+from greybox.report.model_difference import shown_unit, unbroken
 from greybox.report.page import Picture, Section, Table
 
 # of causes that the log shows without a force model
@@ -55,7 +56,7 @@ def _numbers(found: Sequence[Found]) -> Table | None:
     rows = []
     for cause in found:
         for name, q in cause.parameters.items():
-            value = with_error(q.value, q.std)
+            value = unbroken(with_error(q.value, q.std))
             unit = shown_unit(q.unit)
             if q.unit == "rad":
                 unit = f"rad ({with_error(np.rad2deg(q.value), np.rad2deg(q.std))} deg)"

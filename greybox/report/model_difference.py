@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from greybox.model.model import ManoeuvringModel
+from greybox.notebook import with_error
 from greybox.report.page import Marked, Table
 from greybox.vessel.vessel import Thruster, Vessel
 
@@ -52,11 +53,11 @@ def coefficient_table(base: ManoeuvringModel, model: ManoeuvringModel) -> Table:
     old, new = _values(base), _values(model)
     caption = f"Coefficients per sample of {model.sample_time:g} s, ± one standard error"
     if old == new:
-        rows = [[model.label(n), with_error(v, s), shown_unit(u)] for n, (v, s, u) in new.items()]
+        rows = [[model.label(n), _shown(v, s), shown_unit(u)] for n, (v, s, u) in new.items()]
         return Table(caption, ["coefficient", "value", "unit"], rows)
     rows = []
     for name in dict.fromkeys([*old, *new]):
-        cells = [with_error(*side[name][:2]) if name in side else "" for side in (old, new)]
+        cells = [_shown(*side[name][:2]) if name in side else "" for side in (old, new)]
         unit = (new.get(name) or old[name])[2]
         rows.append(
             [model.label(name), *cells, shown_unit(unit), _note(name, base, model, old, new)]
@@ -84,14 +85,8 @@ def shown_unit(unit: str) -> str:
     return "" if unit == "1" else unit.replace("^2", "²").replace("^3", "³")
 
 
-def with_error(value: float, std: float) -> str:
-    """Return a value with its standard error, to the latter's second digit."""
-    if not np.isfinite(std) or std <= 0:
-        return f"{value:.4g}"
-    decimals = 1 - int(np.floor(np.log10(std)))
-    if 0 <= decimals <= 7 and abs(value) < 1e6:
-        return f"{value:.{decimals}f} ± {std:.{decimals}f}"
-    return unbroken(f"{value:.3g} ± {std:.2g}")
+def _shown(value: float, std: float) -> str:
+    return unbroken(with_error(value, std))
 
 
 def unbroken(number: str) -> str:
@@ -105,7 +100,7 @@ def other_changes(base: ManoeuvringModel, model: ManoeuvringModel) -> list[str]:
     told += [f"{c.sentence}, on the log's clock." for c in model.changes if c not in base.changes]
     for name, (value, std) in model.disturbances.items():
         if name not in base.disturbances:
-            told.append(f"{name} is {with_error(value, std)} m/s; before, the water stood still.")
+            told.append(f"{name} is {_shown(value, std)} m/s; before, the water stood still.")
     if base.integrator != model.integrator:
         told.append(f"The integrator is {model.integrator}, it was {base.integrator}.")
     return told

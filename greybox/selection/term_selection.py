@@ -288,7 +288,10 @@ def select_terms(
     step = next((s for s, _, behind, se in steps if behind <= max(se, near)), own)
     logs = with_commands(logs, step.commands)
     fit = 100 * (1 - np.exp(-ranking.score / 100))
-    counts = [size, *(n for _, n in alternatives)]
+    sets = [_of_size(whole[b], n) for b, n in alternatives]
+    means = selection.model.means
+    # a mean current or wind is no term
+    counts = [size, *(sum(n not in means for n in s.terms) for s in sets if s)]
     rows = [
         {
             "model": f"{n} terms" if i else present,
@@ -303,7 +306,7 @@ def select_terms(
     ]
     said = (
         f"terms were selected by free runs on parts of the logs that were left out in turn: "
-        f"{size_shown} terms (thrust ~ {thrust}) have a fit of {fit[shown]:.1f} % and {present} "
+        f"{counts[shown]} terms (thrust ~ {thrust}) have a fit of {fit[shown]:.1f} % and {present} "
         f"{fit[0]:.1f} % (of the geometric mean error over channels and parts, in deviations of "
         f"the logs); "
         + (

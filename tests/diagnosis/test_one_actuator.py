@@ -63,7 +63,7 @@ def test_a_rudder_may_be_late_by_itself() -> None:
     said = known_causes()["thruster_lag"].evidence_of(
         lags["thruster_lag:delta"], {"lag": (2.0, 0.1)}
     )
-    assert said == "delta alone acts with a time constant of 2.0 ± 0.1 s after it is logged"
+    assert said == "delta alone acts with a time constant of 2.00 ± 0.10 s after it is logged"
 
 
 def test_angles_of_one_make_may_be_late_together() -> None:
@@ -79,7 +79,7 @@ def test_angles_of_one_make_may_be_late_together() -> None:
     assert late.delayed_commands == ("alpha_port", "alpha_star")
     assert known_causes()["input_delay"].evidence_of(
         delays["input_delay:angle"], {"delay": (1.5, 0.1)}
-    ) == "the angles act 1.5 ± 0.1 s after they are logged"  # fmt: skip
+    ) == "the angles act 1.50 ± 0.10 s after they are logged"  # fmt: skip
 
 
 def test_a_ship_has_one_lag_one_delay_and_one_limit() -> None:

@@ -24,6 +24,7 @@ from greybox.diagnosis.result import (
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel
 from greybox.model.run.changes import Change
+from greybox.notebook import with_error
 from greybox.report.diagnosed_causes import probability
 from greybox.report.diagnosis import diagnosis_page
 from greybox.report.diagnosis_figures import command_figure, most_followed
@@ -33,7 +34,6 @@ from greybox.report.model_difference import (
     coefficient_table,
     marked_equations,
     other_changes,
-    with_error,
 )
 from greybox.report.page import render, write_page
 from greybox.study.chapter6 import TRUE
@@ -393,7 +393,7 @@ def test_coefficients_that_stood_for_a_sum_are_told():
     [
         (0.31234, 0.0123, "0.312 ± 0.012"),
         (1234.5, 12.0, "1234 ± 12"),
-        (3.2e-9, 1e-10, "3.2e−09 ± 1e−10"),
+        (3.2e-9, 1e-10, "3.20e-09 ± 1.0e-10"),
         (0.25, 0.0, "0.25"),
         (0.25, np.inf, "0.25"),
     ],

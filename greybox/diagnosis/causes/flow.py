@@ -10,6 +10,7 @@ from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.model.disturbances import TURNING
 from greybox.model.terms import parameter_unit, parse_term
+from greybox.notebook import with_error
 
 # no current is stronger [m/s]
 _STRONGEST = 5.0
@@ -57,8 +58,8 @@ class Current(Cause):
         std = np.hypot(north * a, east * b) / speed if speed else np.hypot(a, b)
         return (
             f"the errors of surge and sway turn with the heading as in a current of "
-            f"{speed:.2g} ± {std:.1g} m/s towards {np.rad2deg(np.arctan2(east, north)) % 360:.0f} "
-            f"deg"
+            f"{with_error(speed, float(std))} m/s towards "
+            f"{np.rad2deg(np.arctan2(east, north)) % 360:.0f} deg"
         )
 
 

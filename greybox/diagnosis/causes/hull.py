@@ -9,6 +9,7 @@ import numpy as np
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.model.terms import parameter_unit, parse_term
+from greybox.notebook import with_error
 
 _WORDS = {"u": "surge", "v": "sway", "r": "yaw"}
 
@@ -30,7 +31,7 @@ def term_hypothesis(cause: str, names: Sequence[str], context: Context) -> Hypot
 
 def listed(values: Mapping[str, tuple[float, float]]) -> str:
     """Return estimates as text."""
-    return ", ".join(f"{n} = {v:.2g} ± {s:.1g}" for n, (v, s) in values.items())
+    return ", ".join(f"{n} = {with_error(v, s)}" for n, (v, s) in values.items())
 
 
 def equations(values: Mapping[str, tuple[float, float]]) -> str:

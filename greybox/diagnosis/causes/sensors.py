@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.ship import Ship, Wire
+from greybox.notebook import with_error
 
 Array = NDArray[np.float64]
 
@@ -47,10 +48,10 @@ class HeadingBias(Cause):
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say by how much."""
-        value, std = values["heading_bias"]
+        value, std = map(float, np.rad2deg(values["heading_bias"]))
         return (
-            f"surge and sway are turned against the ship's axes by {np.rad2deg(value):.1f} ± "
-            f"{np.rad2deg(std):.1g} deg, as by a compass that shows so much too much"
+            f"surge and sway are turned against the ship's axes by {with_error(value, std)} deg, "
+            f"as by a compass that reads too high by as much"
         )
 
 
@@ -123,7 +124,7 @@ class ClockOffset(Cause):
         """Say which and how late."""
         name, (value, std) = next(iter(values.items()))
         return (
-            f"{name.removeprefix('clock_')} comes {abs(value):.2f} ± {std:.1g} s too "
+            f"{name.removeprefix('clock_')} comes {with_error(abs(value), std)} s too "
             f"{'late' if value > 0 else 'early'} against the other channels"
         )
 

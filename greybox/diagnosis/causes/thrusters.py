@@ -14,6 +14,7 @@ from greybox.diagnosis.causes.hull import listed, term_hypothesis
 from greybox.diagnosis.causes.sensors import UNRESOLVED
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.ship import Ship
+from greybox.notebook import with_error
 from greybox.vessel.vessel import Actuation, DelayOn, LagHeld, LagOn
 
 Array = NDArray[np.float64]
@@ -171,7 +172,7 @@ class ThrusterLag(Cause):
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say how slow."""
         value, std = values["lag"]
-        return f"forces follow their commands with a time constant of {value:.1f} ± {std:.1g} s"
+        return f"forces follow their commands with a time constant of {with_error(value, std)} s"
 
     def evidence_of(self, hypothesis: Hypothesis, values: Mapping[str, tuple[float, float]]) -> str:
         """Say which commands are slow, where not all of them are."""
@@ -180,7 +181,7 @@ class ThrusterLag(Cause):
         if not what:
             return self.evidence(values)
         they = "it is" if hypothesis.place else "they are"
-        return f"{what} with a time constant of {value:.1f} ± {std:.1g} s after {they} logged"
+        return f"{what} with a time constant of {with_error(value, std)} s after {they} logged"
 
 
 class InputDelay(Cause):
@@ -229,14 +230,14 @@ class InputDelay(Cause):
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say how late."""
         value, std = values["delay"]
-        return f"commands act {value:.1f} ± {std:.1g} s after they are logged"
+        return f"commands act {with_error(value, std)} s after they are logged"
 
     def evidence_of(self, hypothesis: Hypothesis, values: Mapping[str, tuple[float, float]]) -> str:
         """Say which commands are late, where not all of them are."""
         value, std = values["delay"]
         they = "it is" if hypothesis.place else "they are"
         what = _late(hypothesis) or "commands act"
-        return f"{what} {value:.1f} ± {std:.1g} s after {they} logged"
+        return f"{what} {with_error(value, std)} s after {they} logged"
 
 
 class RateLimit(Cause):
@@ -283,7 +284,7 @@ class RateLimit(Cause):
         """Say which and how fast."""
         name, (value, std) = next(iter(values.items()))
         return (
-            f"{name.removeprefix('rate_')} moves by at most {value:.2g} ± {std:.1g} per second, "
+            f"{name.removeprefix('rate_')} moves by at most {with_error(value, std)} per second, "
             f"slower than it is logged"
         )
 
@@ -411,8 +412,8 @@ class AngleOffset(Cause):
         """Say which and by how much."""
         name, (value, std) = next(iter(values.items()))
         return (
-            f"{name.removeprefix('offset_')} is {np.rad2deg(value):.1f} ± {np.rad2deg(std):.1g} "
-            f"deg more than logged"
+            f"{name.removeprefix('offset_')} is "
+            f"{with_error(float(np.rad2deg(value)), float(np.rad2deg(std)))} deg more than logged"
         )
 
 
