@@ -177,7 +177,10 @@ class DiagnosisBuilder:
         if any(p.fit.escaped or p.held_fit.escaped for p in pairs):
             return ()
 
-        drops: list[Drop] = [partial(_leave_out, c.hypothesis) for c in named]
+        alike = by_name(named)
+        drops: list[Drop] = [
+            partial(leave_out, [c.hypothesis for c in causes]) for causes in alike.values()
+        ]
         nameless = self._nameless(final)
         if nameless:
             drops.append(partial(_at_zero, nameless))
@@ -189,14 +192,17 @@ class DiagnosisBuilder:
                 *(partial(errors_without, pairs, before, drop, first) for drop in drops),
             ],
         )
-        causes = map(
+        parts = map(
             SwitchedOff,
-            [c.hypothesis.id for c in named],
+            alike,
             without,
-            [_relative(quantities_of(problem, c, final)) for c in named],
+            [
+                min(_relative(quantities_of(problem, c, final)) for c in causes)
+                for causes in alike.values()
+            ],
         )
         terms = without[-1] if nameless else None
-        return error_budget(base, pairs, list(causes), terms, waves, self.seed)
+        return error_budget(base, pairs, list(parts), terms, waves, self.seed)
 
     def _nameless(self, final: Fit) -> frozenset[int]:
         """Return the places of terms of the extended model that stand for no cause."""
@@ -361,8 +367,19 @@ def diverging(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> list[str]:
     ]
 
 
-def _leave_out(hypothesis: Hypothesis, problem: Problem, point: Point) -> Point:
-    return problem.drop(point, hypothesis)
+def by_name(causes: Sequence[Candidate]) -> dict[str, list[Candidate]]:
+    """Return causes by the id that tells them: two asymmetries are one part of an error."""
+    found: dict[str, list[Candidate]] = {}
+    for cause in causes:
+        found.setdefault(cause.hypothesis.id, []).append(cause)
+    return found
+
+
+def leave_out(hypotheses: Sequence[Hypothesis], problem: Problem, point: Point) -> Point:
+    """Return a point of the extended model without some of its hypotheses."""
+    for hypothesis in hypotheses:
+        point = problem.drop(point, hypothesis)
+    return point
 
 
 def _at_zero(terms: frozenset[int], problem: Problem, point: Point) -> Point:

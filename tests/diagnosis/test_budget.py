@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from greybox.diagnosis.budget import MOTION, REST, SENSOR, SwitchedOff, error_budget, errors_without
+from greybox.diagnosis.builder import by_name, leave_out
 from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.fitting import Problem
@@ -69,6 +71,19 @@ def test_a_cause_takes_what_switching_it_off_does(pair: Pair) -> None:
         # each takes what the two do only together
         both = -2 * (one * other)[:, i].sum() / whole
         assert budget[REST].share[state] == pytest.approx(both, abs=0.03)
+
+
+def test_causes_of_one_name_are_one_part_of_the_error() -> None:
+    trial = draw(np.random.default_rng([3, 9]), samples=300)
+    ready = prepare([trial.estimation], [trial.validation], None, "thesis", ["asymmetry"])
+    base = ready.base()
+    problem, (one, two) = ready.case.problem(base.integrator), ready.hypotheses[:2]
+    assert one.id == two.id
+    assert one.key != two.key
+    both = problem.add(problem.add(base.point, one), two)
+    assert leave_out([one, two], problem, both).hypotheses == ()
+    causes = [SimpleNamespace(hypothesis=h) for h in (one, two)]
+    assert by_name(causes) == {"asymmetry": causes}
 
 
 def test_a_cause_without_which_no_run_is_bounded_is_not_split(pair: Pair) -> None:
