@@ -146,8 +146,8 @@ def test_a_run_without_a_covariance_is_judged_without_it(
 
 @pytest.mark.long
 def test_variances_stay_positive_where_numbers_are_hardly_known() -> None:
-    # a run at the edge of stability: rounding had left a negative variance, and no verdict; rounding
-    # decides there whether a force that keeps the run in bounds stands, but not that all is well
+    # a run at the edge of stability: rounding had left a negative variance, and no verdict.
+    # It decides there whether a force that keeps the run in bounds stands, but not that all is well
     rng = np.random.default_rng([907, zlib.crc32(b"dead_bandpulses"), 2])
     trial = draw(rng, ("dead_band",), kind="pulses")
     found = diagnose([trial.estimation], validate=[trial.validation])
