@@ -49,15 +49,17 @@ void greybox_recursion(long long runs, long long steps, long long n, long long m
 """
 
 
-_PUSHED = """
-__attribute__((optimize("O3")))
-void greybox_pushed(long long rows, long long samples, long long taps,
-                    const double* restrict b, const double* restrict e, double* restrict y) {
-  long long row, k, d;
+_FILTERED = """
+void greybox_filtered(long long rows, long long samples, long long taps, const double* restrict b,
+                      const double* restrict a, double* restrict z, const double* restrict e,
+                      double* restrict y) {
+  long long row, k, i;
   for (row = 0; row < rows; row++, e += samples, y += samples) {
-    for (d = 0; d < taps && d < samples; d++) {
-      const double share = b[d];
-      if (share != 0.0) for (k = d; k < samples; k++) y[k] += share * e[k - d];
+    for (i = 0; i < taps; i++) z[i] = 0.0;
+    for (k = 0; k < samples; k++) {
+      const double x = e[k], out = z[0] + b[0] * x;
+      for (i = 0; i + 1 < taps; i++) z[i] = z[i + 1] + b[i + 1] * x - a[i + 1] * out;
+      y[k] += out;
     }
   }
 }
@@ -68,9 +70,9 @@ void greybox_recursive(long long rows, long long samples, long long taps,
   long long row, k, d;
   for (row = 0; row < rows; row++, y += samples) {
     for (k = 1; k < samples; k++) {
-      double value = y[k];
-      for (d = k < taps ? k : taps - 1; d > 0; d--) value -= a[d] * y[k - d];
-      y[k] = value;
+      double past = 0.0;
+      for (d = k < taps ? k : taps - 1; d > 0; d--) past -= a[d] * y[k - d];
+      y[k] += past;
     }
   }
 }
@@ -86,7 +88,7 @@ _SOURCES = {
     )
     for name, source, whole, arrays in (
         ("greybox_recursion", _RECURSION, 4, 3),
-        ("greybox_pushed", _PUSHED, 3, 3),
+        ("greybox_filtered", _FILTERED, 3, 5),
         ("greybox_recursive", _RECURSIVE, 3, 2),
     )
 }
@@ -190,17 +192,19 @@ def filtered(numerators: Array, denominator: Array, channels: Sequence[Array]) -
     list of ndarray
         (m, N) of each of the k outputs.
     """
-    pushed = np.zeros((len(numerators), *channels[0].shape))
-    in_c = _compiled("greybox_pushed")
+    out = np.zeros((len(numerators), *channels[0].shape))
+    in_c = _compiled("greybox_filtered")
+    # the state of a filter has a zero behind it
+    a, state = np.ascontiguousarray(denominator, float), np.zeros(len(denominator))
     for i, j in zip(*np.nonzero(numerators.any(axis=2)), strict=True):
-        shares, y, e = numerators[i, j], pushed[i], np.ascontiguousarray(channels[j], float)
+        b, y, e = numerators[i, j], out[i], np.ascontiguousarray(channels[j], float)
         if in_c is not None:
-            shares = np.ascontiguousarray(shares, float)
-            in_c(*y.shape, len(shares), *(x.ctypes.data for x in (shares, e, y)))
+            b = np.ascontiguousarray(b, float)
+            in_c(*y.shape, len(b), *(x.ctypes.data for x in (b, a, state, e, y)))
             continue
-        for ago in np.flatnonzero(shares[: y.shape[1]]):
-            y[:, ago:] += shares[ago] * e[:, : y.shape[1] - ago]
-    return list(_recursive(denominator, pushed))
+        for ago in np.flatnonzero(b[: y.shape[1]]):
+            y[:, ago:] += b[ago] * e[:, : y.shape[1] - ago]
+    return list(out if in_c is not None else _recursive(a, out))
 
 
 def _stepped(a: Array, b: Array, out: Array) -> None:
