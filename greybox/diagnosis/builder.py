@@ -254,7 +254,7 @@ class DiagnosisBuilder:
         """Whether a rival, too, does more than a generic force."""
         pairs = [self.case.held_out(f.integrator).pairs(f) for f in (rival.fit, without)]
         problem = self.case.problem(rival.fit.integrator)
-        return standing(problem, rival.hypothesis, rival.fit, *pairs).stands
+        return standing(problem, rival.hypothesis, rival.fit, *pairs, self.found.tried).stands
 
     def gain(
         self,

@@ -541,7 +541,7 @@ def _stood(
     def work(k: int) -> tuple[Fit, tuple[Standing, Proof]]:
         without = _without(problem, fit, asked[k])
         hypothesis = asked[k].hypothesis
-        weight = standing(problem, hypothesis, fit, pairs, held_out.pairs(without))
+        weight = standing(problem, hypothesis, fit, pairs, held_out.pairs(without), tried)
         return without, (weight, held_out.prove(without, fit))
 
     rest = [problem.drop(fit.point, c.hypothesis) for c in asked]

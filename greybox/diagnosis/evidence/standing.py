@@ -21,7 +21,14 @@ from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import CURRENTS
-from greybox.diagnosis.thresholds import AS_CHOSEN, LEAST_SHARE, OWN_SHARE, PROVEN, SAME
+from greybox.diagnosis.thresholds import (
+    AS_CHOSEN,
+    LEAST_SHARE,
+    OWN_SHARE,
+    PROVEN,
+    SAME,
+    SIGNIFICANT,
+)
 from greybox.model.terms import parse_term
 
 Array = NDArray[np.float64]
@@ -54,6 +61,8 @@ class Standing:
         That of the surest of the numbers with its movement counted as a standard error.
     level : float
         Significance that a gain on held-out logs must have.
+    tried : int
+        Causes that were scored, of which this is one.
     """
 
     beyond: Proof
@@ -63,21 +72,28 @@ class Standing:
     clear: float
     told: float
     level: float = PROVEN
+    tried: int = 1
 
     @property
     def stands(self) -> bool:
         """Whether the cause explains what no generic force explains as well."""
         gains = self.beyond.gain > 0 and self.beyond.p_value < self.level
         own = self.share is not None and self.share >= OWN_SHARE and self.half < self.level
-        # what heading, time or earlier commands do has no share of such a force to show for it, and
-        # that a run leaves every bound without a cause tells nothing of its size
-        alike = self.share is not None and np.isfinite(self.beyond.gain)
-        sure = self.told < (SAME if alike else PROVEN)
-        return (gains or own) and self.clear < PROVEN and sure
+        return (gains or own) and self.clear < PROVEN and self._sure
+
+    @property
+    def _sure(self) -> bool:
+        """Whether one of its numbers is known well enough."""
+        if np.isinf(self.beyond.gain):
+            # many a cause keeps a run within bounds: its number alone speaks for it, and was the
+            # best of all that were tried
+            return self.tried * self.told < SIGNIFICANT
+        # what heading, time or earlier commands do has no share of such a force to show for it
+        return self.told < (PROVEN if self.share is None else SAME)
 
 
 def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequence[Pair],
-             without: Sequence[Pair]) -> Standing:  # fmt: skip
+             without: Sequence[Pair], tried: int) -> Standing:  # fmt: skip
     """Weigh a cause against a generic force.
 
     Parameters
@@ -88,13 +104,15 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
         With the cause in force.
     pairs, without : sequence of Pair
         That fit, and the one without the cause, on what is held out.
+    tried : int
+        Causes that were scored.
     """
     moved, clear, told = _moved(problem, hypothesis, with_it, pairs)
     level = level_of(with_it)
     if any(p.held_fit.escaped or p.fit.escaped for p in (*pairs, *without)):
         better = not any(p.held_fit.escaped for p in pairs)
         proof = proof_of(np.array([np.inf if better else -np.inf]))
-        return Standing(proof, None, 1.0, moved, clear, told, level)
+        return Standing(proof, None, 1.0, moved, clear, told, level, tried)
     use = _own_arguments(problem, hypothesis)
     for pair in without:
         fit_generic_forces(pair, [MOTION_AND_COMMANDS, *([] if use is None else [use])])
@@ -109,7 +127,7 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
         gained, could = plain - own, plain - generic
         share = float(gained.sum() / could.sum()) if could.sum() > 0 else np.inf
         half = proof_of(gained - LEAST_SHARE * could).p_value
-    return Standing(beyond, share, half, moved, clear, told, level)
+    return Standing(beyond, share, half, moved, clear, told, level, tried)
 
 
 def level_of(fit: Fit) -> float:
