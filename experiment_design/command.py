@@ -642,6 +642,7 @@ def _run_between(
 ) -> None:
     """Design the trial between two models and write it."""
     from experiment_design.discriminate import design_between
+    from experiment_design.prepare import expected_disturbances
     from experiment_design.request.request import CandidateModel, full_structure
     from greybox.errors import UsageError
     from greybox.model.model import load_model
@@ -650,7 +651,8 @@ def _run_between(
     first, second = (Path(p).stem for p in options.between)
     if first == second:
         first, second = options.between
-    request, _ = _prepared(options, model, _asked(options, model), vessel, sailed)
+    asked = _asked(options, model)
+    request, _ = _prepared(options, model, asked, vessel, sailed)
     notes = request.notes
     if options.model not in (None, options.between[0]):
         notes = (
@@ -671,9 +673,10 @@ def _run_between(
     other = other.at_final_parameters()
     structure, theta = full_structure(other)
     vessel = with_actuators_of(request.vessel, other.vessel)
+    d = expected_disturbances(other, asked)
     found = design_between(
         request,
-        CandidateModel(second, structure, theta, other.d, vessel, other.integrator),
+        CandidateModel(second, structure, theta, d, vessel, other.integrator),
         (first, second),
         best_effort=options.best_effort,
         progress=progress("design"),

@@ -118,11 +118,7 @@ def prepare_request(
     noise = noise_levels(model, vessel, asked.process_noise)
     notes.append(f"noise: {noise.source}")
     predictor = _predictor(model, structure, asked, notes)
-    d, dt = np.array(model.d, float), model.sample_time
-    if asked.current is not None:
-        d[:2] = asked.current
-    if asked.wind is not None:
-        d[2:] = asked.wind
+    d, dt = expected_disturbances(model, asked), model.sample_time
     measuring = PREDICTORS[predictor].air_measured
     automatic = asked.regime.strip().lower() == "auto"
     parts = candidate_regimes(structure.states)[:1]
@@ -216,6 +212,16 @@ def prepare_request(
     return replace(
         base, regimes=regimes, starts=starts, notes=tuple(notes), of_regime=tuple(of_regime)
     )
+
+
+def expected_disturbances(model: ManoeuvringModel, asked: DesignRequest) -> Array:
+    """Return the means (nd,) of current and wind [m/s]: the model's, where none are asked for."""
+    d = np.array(model.d, float)
+    if asked.current is not None:
+        d[:2] = asked.current
+    if asked.wind is not None:
+        d[2:] = asked.wind
+    return d
 
 
 def both_sides(asked: DesignRequest, model: ManoeuvringModel) -> DesignRequest:

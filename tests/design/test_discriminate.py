@@ -6,14 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from designs import make_request
+from designs import make_request, thesis_model
 
 from experiment_design import CandidateModel, design_between, design_trial
 from experiment_design.criteria.t_optimality import Pair
 from experiment_design.discriminate import probability_right
 from experiment_design.request.request import build_problem
+from greybox.commands.main import main
 from greybox.errors import UsageError
 from greybox.model.run.simulation import simulate
+from greybox.vessel.toml import load_vessel
 
 
 def _rival(request, current=(0.0, 0.0), **parameters):
@@ -148,3 +150,23 @@ def test_explanations_that_are_one():
     both = replace(request, regimes=request.regimes * 2, starts=request.starts * 2)
     with pytest.raises(UsageError, match="one trial at a time"):
         design_between(both, _rival(request, Nvr=-0.08), ("a", "b"))
+
+
+def test_an_expected_current_and_wind_move_both_explanations(tmp_path, monkeypatch):
+    paths = [str(tmp_path / name) for name in ("a.json", "b.json")]
+    for path in paths:
+        replace(thesis_model(), vessel=load_vessel("thesis")).save(path)
+    seen = []
+
+    def stop(request, rival, *_, **__):
+        seen.append((request.d, rival.d))
+        raise UsageError("seen.")
+
+    monkeypatch.setattr("experiment_design.discriminate.design_between", stop)
+    told = ["--regime", "u+v+", "--predictor", "basic", "--current", "0.3,0.1", "--wind", "4,-2"]
+    out = str(tmp_path / "plan.csv")
+    asked = ["design", "--vessel", "thesis", "--duration", "100", "--between", *paths, *told]
+    assert main([*asked, "--out", out]) == 1
+    assert len(seen) == 1
+    for d in seen[0]:
+        np.testing.assert_array_equal(d, [0.3, 0.1, 4.0, -2.0])
