@@ -182,13 +182,20 @@ def design_between(
     Raises
     ------
     UsageError
-        The two predict the same motion, or what is asked does not go with two models.
+        The two predict the same motion or have other states, or what is asked does not go with
+        two models.
 
     References
     ----------
     Atkinson and Fedorov (1975), T-optimality; Kullback and Leibler (1951).
     """
     require_compatible(request.given | {"between"})
+    mine, other = request.structure.states, rival.structure.states
+    if set(mine) != set(other):
+        raise UsageError(
+            f"{names[0]} has the states {', '.join(mine)} and {names[1]} {', '.join(other)}: name "
+            f"two models of the same states, whose motions can be compared."
+        )
     first = CandidateModel(
         names[0], request.structure, request.theta, request.d, integrator=request.integrator
     )

@@ -132,7 +132,7 @@ class Contrast(Objective):
 
 
 class Pair:
-    """Two models on the same commands, each filtered by the other.
+    """Two models of the same states on the same commands, each filtered by the other.
 
     Parameters
     ----------
@@ -144,9 +144,8 @@ class Pair:
 
     def __init__(self, first: Rollout, second: Rollout, noise: NoiseLevels, samples: int) -> None:
         self.first, self.second, self.samples = first, second, samples
-        common = [s for s in first.structure.states if s in second.structure.states]
-        turning = "r" in common
-        self.outputs = (*common, *(["psi"] if turning else []))
+        states = first.structure.states
+        self.outputs = (*states, "psi") if "r" in states else states
         self._filters = [steady_filter(m, self.outputs, noise) for m in (first, second)]
         self.roots = [np.linalg.cholesky(np.linalg.inv(f.covariance)).T for f in self._filters]
         self._build()

@@ -571,9 +571,9 @@ def _candidate_rollout(request: PreparedRequest, candidate: CandidateModel, tria
 
 
 def candidate_start(request: PreparedRequest, candidate: CandidateModel, trial: int) -> Array:
-    """Return a candidate's initial states and heading, those that it lacks left out."""
+    """Return a candidate's initial states and heading, in its own order."""
     start = dict(zip((*request.structure.states, "psi"), request.starts[trial], strict=True))
-    return np.array([start.get(s, 0.0) for s in (*candidate.structure.states, "psi")])
+    return np.array([start[s] for s in (*candidate.structure.states, "psi")])
 
 
 def draw_gusts(request: PreparedRequest) -> Array:

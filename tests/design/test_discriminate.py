@@ -170,3 +170,18 @@ def test_an_expected_current_and_wind_move_both_explanations(tmp_path, monkeypat
     assert len(seen) == 1
     for d in seen[0]:
         np.testing.assert_array_equal(d, [0.3, 0.1, 4.0, -2.0])
+
+
+def test_explanations_of_other_states(tmp_path, capsys):
+    paths = [str(tmp_path / name) for name in ("a.json", "b.json")]
+    for name, path in zip(("thesis", "surge"), paths, strict=True):
+        replace(thesis_model(name), vessel=load_vessel("thesis")).save(path)
+    out = tmp_path / "plan.csv"
+    asked = ["design", "--vessel", "thesis", "--duration", "100", "--out", str(out)]
+    for pair, regime in ((paths, "u+v+"), (paths, "u+"), (paths[::-1], "auto")):
+        assert main([*asked, "--regime", regime, "--between", *pair]) == 1
+        said = capsys.readouterr().err
+        assert "name two models of the same states" in said
+        assert "states u, v, r" in said or "and a u, v, r" in said
+        assert said.count("\n") == 1
+    assert not out.exists()
