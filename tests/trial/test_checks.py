@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from virtual import as_recording, recorded
 
-from greybox.errors import UsageError
+from greybox.errors import LogError, UsageError
 from greybox.trial.checks.check import check_files, check_recording
 from greybox.trial.checks.course import course_findings
 from greybox.trial.checks.finding import IDS
+from greybox.trial.convert.convert import import_recording
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs, repair
 from greybox.vessel.toml import load_vessel, vessel_from_dict
@@ -287,6 +288,19 @@ def test_times_that_repeat_and_go_back(ship):
     assert set(f) == {"duplicate_time"}
     assert f["duplicate_time"].value == 2
     assert "1 repeats the one before and 1 goes back" in f["duplicate_time"].evidence
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.13])
+def test_two_runs_in_one_file_are_found_and_not_mended(offset, ship):
+    one, two = recorded(3, 2.0, seconds=100), recorded(4, 2.0, seconds=100)
+    two["t"] = two["t"] + offset
+    log = as_recording({k: np.concatenate([one[k], two[k]]) for k in one})
+    (found,) = check_recording(log, ship).findings
+    assert (found.id, found.safe, found.repair) == ("duplicate_time", False, ())
+    assert f"goes back, from 100 to {offset:g} s, where a second run begins" in found.evidence
+    assert found.fix == "cut the file there and import each run"
+    with pytest.raises(LogError, match=r"are there twice: cut the file there and import each run"):
+        import_recording(repair(log, ship, check_recording(log, ship))[0], ship)
 
 
 def test_gap_nan_spike_stuck(ship):

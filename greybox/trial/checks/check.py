@@ -35,6 +35,7 @@ from greybox.trial.checks.thruster_response import response_findings
 from greybox.trial.checks.time_format import time_format_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.channel_mapping import read_recording
+from greybox.trial.convert.deduplicate import first_run
 from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.raw_log import Recording
 from greybox.trial.repair import apply_repairs
@@ -205,8 +206,8 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
     raw += missing_findings(recording)
     raw += angle_unit_findings(recording, vessel)
     # before the heading is unwrapped
-    raw += wrap_findings(apply_repairs(recording, raw))
-    whole = derive_signals(apply_repairs(recording, raw))
+    raw += wrap_findings(first_run(apply_repairs(recording, raw)))
+    whole = derive_signals(first_run(apply_repairs(recording, raw)))
     log = _Log(recording, raw, {}, whole)
     log.add(hold_findings(_independent(whole)))
     measured = _independent(log.mended)

@@ -12,6 +12,7 @@ from greybox.numerics.robust import FROM_MEDIAN, robust_deviation
 from greybox.rotation import body_to_ned
 from greybox.trial.checks.finding import Finding, declare_unit
 from greybox.trial.convert.channel_mapping import beyond_reach
+from greybox.trial.convert.deduplicate import CUT_RUNS, second_run
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, runs
 from greybox.trial.gaps import GAP, HOLE, usual_step
@@ -68,6 +69,20 @@ def time_findings(recording: Recording) -> list[Finding]:
                 else []
             )
             what += [f"{back} go{'' if back > 1 else 'es'} back"] if back else []
+            second = second_run(finite)
+            if second is None:
+                where = f"the first after t = {finite[k]:.6g} s"
+                fix = (
+                    "sort the rows by time and keep the first of those that repeat "
+                    "(import --fix does)"
+                )
+            else:
+                k, twice = second
+                where = (
+                    f"from {finite[k - 1]:.6g} to {finite[k]:.6g} s, where a second run begins: "
+                    f"{twice:.4g} s are there twice, and the first run alone was checked"
+                )
+                fix, finite = CUT_RUNS, finite[:k]
             found.append(
                 Finding(
                     "duplicate_time",
@@ -75,14 +90,13 @@ def time_findings(recording: Recording) -> list[Finding]:
                     float(count),
                     (float(count), float(count)),
                     "1",
-                    f"of the {len(finite)} times of {listed(names)} {' and '.join(what)}, the "
-                    f"first after t = {finite[k]:.6g} s",
-                    "sort the rows by time and keep the first of those that repeat "
-                    "(import --fix does)",
+                    f"of the {len(steps) + 1} times of {listed(names)} {' and '.join(what)}, "
+                    f"{where}",
+                    fix,
                     ("t",),
-                    (mend("order", names),),
-                    True,
-                    {"t": finite, "steps": steps, "names": names},
+                    (mend("order", names),) if second is None else (),
+                    second is None,
+                    {"t": t[np.isfinite(t)], "steps": steps, "names": names},
                 )
             )
         found += _gaps(names, np.unique(finite))

@@ -19,7 +19,8 @@ Array = NDArray[np.float64]
 # usual steps by which time may go back without there being two runs in a file
 _FAR = 50.0
 _MAX_RUNS = 1000
-_TWO_RUNS = ": cut the file there and import each run, or mend it with --fix"
+# what to do with two runs in one file: none of them is wrong
+CUT_RUNS = "cut the file there and import each run"
 
 
 def clean_signals(recording: Recording, origin: tuple[float, float] | None = None) -> Recording:
@@ -115,7 +116,7 @@ def _order(
             if wrong
             else ""
         )
-        _refuse_two_runs(ordered, back, signal, name, cause)
+        _refuse_two_runs(ordered, signal, name, cause)
         notes.append(
             f"time of {signal} goes back {len(back)} time{'s' if len(back) > 1 else ''}, first "
             f"from {ordered[back[0]]:.6g} to {ordered[back[0] + 1]:.6g} s: put in order{cause}"
@@ -124,18 +125,57 @@ def _order(
     return rows, t[rows]
 
 
-def _refuse_two_runs(t: Array, back: NDArray[np.int64], signal: str, name: str, cause: str) -> None:
+def _refuse_two_runs(t: Array, signal: str, name: str, cause: str) -> None:
     """Refuse times that go back far, over times that are there already."""
+    found = second_run(t)
+    if found is not None:
+        k, twice = found
+        raise LogError(
+            f"time of {signal} in '{name}' goes back from {t[k - 1]:.6g} to {t[k]:.6g} s, over "
+            f"{twice:.4g} s that are there twice{cause or f': {CUT_RUNS}'}."
+        )
+
+
+def second_run(t: Array) -> tuple[int, float] | None:
+    """Find where a second run begins, by times that go back far over times that are there already.
+
+    Parameters
+    ----------
+    t : ndarray
+        (N,) times in the order of the file, each a number [s].
+
+    Returns
+    -------
+    tuple of (int, float), optional
+        Its first row, and the time that both runs cover [s]; None where there is one run.
+    """
+    back = np.flatnonzero(np.diff(t) < 0)
+    if not len(back):
+        return None
     usual = usual_step(np.sort(t)) or float(np.median(np.abs(np.diff(t))))
     far = back[t[back] - t[back + 1] > _FAR * usual]
-    edges = np.concatenate([[0], far + 1, [len(t)]])
     if len(far) > _MAX_RUNS:
-        return
+        return None
+    edges = np.concatenate([[0], far + 1, [len(t)]])
     spans = sorted((t[a:b].min(), t[a:b].max()) for a, b in pairwise(edges))
     for (_, stop), (start, end) in pairwise(spans):
         if min(stop, end) - start > _FAR * usual:
-            k = int(far[0])
-            raise LogError(
-                f"time of {signal} in '{name}' goes back from {t[k]:.6g} to {t[k + 1]:.6g} s, over "
-                f"{min(stop, end) - start:.4g} s that are there twice{cause or _TWO_RUNS}."
-            )
+            return int(far[0]) + 1, float(min(stop, end) - start)
+    return None
+
+
+def first_run(recording: Recording) -> Recording:
+    """Return the recording without what stands behind the first of several runs."""
+    shared: dict[int, int] = {}
+
+    def rows(t: Array) -> int:
+        if id(t) not in shared:
+            finite = np.flatnonzero(np.isfinite(t))
+            found = second_run(t[finite])
+            shared[id(t)] = len(t) if found is None else int(finite[found[0]])
+        return shared[id(t)]
+
+    clocks = {id(s.t): s.t[: rows(s.t)] for s in recording.signals}
+    signals = [replace(s, t=clocks[id(s.t)], value=s.value[: rows(s.t)]) for s in recording.signals]
+    text = {n: (t[: rows(t)], words[: rows(t)]) for n, (t, words) in recording.text.items()}
+    return replace(recording, text=text).with_signals(signals)
