@@ -395,9 +395,9 @@ def design_for_causes(
             )
         ]
 
-    tightened, searches, keeping = tightened_search(request, campaign)
+    searches, keeping = tightened_search(request, campaign)
     design = described_plan(
-        request, tightened, searches, keeping, kept_starts=int(kept_start), began=began,
+        request, searches, keeping, kept_starts=int(kept_start), began=began,
         certificate="a plan for causes has no bound to be measured against",
     )  # fmt: skip
 

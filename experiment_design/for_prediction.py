@@ -19,6 +19,7 @@ from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
     tighten,
 )
+from experiment_design.feasibility.least_violation import least_change
 from experiment_design.information.envelope import Envelope, build_envelope
 from experiment_design.optimise.campaign import random_campaign
 from experiment_design.optimise.envelope_search import (
@@ -27,6 +28,7 @@ from experiment_design.optimise.envelope_search import (
     usual_beginnings,
 )
 from experiment_design.optimise.lead_in import after_lead_in
+from experiment_design.optimise.search import assess
 from experiment_design.output.result import Design, PlanPart
 from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.request import PreparedRequest, build_problem
@@ -304,11 +306,11 @@ def _design(
     if kept_starts:
         asked = after_lead_in(asked)
     before = log_moments(found, sailed)
-    tightened, searches, keeping = tightened_search(
+    searches, keeping = tightened_search(
         asked, lambda r: _campaign(r, found, before, workers)
     )
     design = described_plan(
-        asked, tightened, searches, keeping, kept_starts=kept_starts, began=began,
+        asked, searches, keeping, kept_starts=kept_starts, began=began,
         certificate="a plan for prediction has no bound to be measured against",
     )  # fmt: skip
     usual = usual_beginnings(found, asked.schedule.holds, asked.hold).shape[1]
@@ -357,7 +359,6 @@ def _parts(request: PreparedRequest, led: tuple[PlanPart, ...], usual: int) -> t
 
 def described_plan(
     request: PreparedRequest,
-    tightened: PreparedRequest,
     searches: Sequence[EnvelopeSearch],
     keeping: ConstraintSatisfaction | None,
     *,
@@ -369,8 +370,8 @@ def described_plan(
 
     Parameters
     ----------
-    request, tightened : PreparedRequest
-        As asked for, and with the limits of the last search.
+    request : PreparedRequest
+        As asked for.
     searches : sequence of EnvelopeSearch
         One per trial.
     keeping : ConstraintSatisfaction or None
@@ -388,14 +389,12 @@ def described_plan(
     """
     problems = [build_problem(request, t) for t in range(request.trials)]
     short = [
-        (name, float(m))
-        for search in searches
-        for name, m in zip(problems[0].scenarios[0].limits.all_limits, search.candidate.missed,
-                           strict=True)
-        if m > 1e-3
-    ]  # fmt: skip
-    if short and not tightened.backoff:
-        name, amount = max(short, key=lambda item: item[1])
+        change
+        for p, search in zip(problems, searches, strict=True)
+        for change in least_change(p, assess(p, search.candidate.unit[None])[0])
+    ]
+    if short:
+        name, amount = max(short, key=lambda item: item[1] / item[0].scale)
         raise InfeasibleError(
             f"no plan was found that keeps the {name.words} of {name.bound:g} {name.unit}: the "
             f"best misses it by {amount:.3g} {name.unit}. Widen it ({name.option}), or narrow "
@@ -415,7 +414,7 @@ def described_plan(
 
 def tightened_search(
     request: PreparedRequest, campaign: Callable[[PreparedRequest], list[EnvelopeSearch]]
-) -> tuple[PreparedRequest, list[EnvelopeSearch], ConstraintSatisfaction | None]:
+) -> tuple[list[EnvelopeSearch], ConstraintSatisfaction | None]:
     """Search all trials, with limits tightened until they are kept with the wanted probability.
 
     Parameters
@@ -427,15 +426,16 @@ def tightened_search(
     Returns
     -------
     tuple
-        The request with the limits of that search, what was found, and how the limits are kept.
+        What was found, and how the limits are kept.
     """
     searches = campaign(request)
     if not request.uncertain:
-        return request, searches, None
-    return tighten(
+        return searches, None
+    _, searches, keeping = tighten(
         request, searches, lambda tighter, _: campaign(tighter),
         lambda found: [s.candidate.unit for s in found], _TIGHTENINGS,
     )  # fmt: skip
+    return searches, keeping
 
 
 def _campaign(

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.constraints.kinds.margin import Margin
+from experiment_design.constraints.limits import TOLERANCE
 from experiment_design.excitation.rollout import Rollout
-from experiment_design.request.request import PreparedRequest
+from experiment_design.optimise.search import assess
+from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.numerics.binomial import wilson_interval
 
 Array = NDArray[np.float64]
@@ -127,6 +129,8 @@ def tighten(
 ) -> tuple[PreparedRequest, Found, ConstraintSatisfaction]:
     """Search again with tighter path limits until they are kept with the wanted probability.
 
+    What is found then keeps all limits as they were asked for, or ends it.
+
     Parameters
     ----------
     request : PreparedRequest
@@ -144,6 +148,7 @@ def tighten(
     tuple
         The request of the search that keeps the limits best, what it found, and how it keeps them.
     """
+    problems = [build_problem(request, t) for t in range(request.trials)]
     keeping = keep_probability(request, units(first))
     best = (request, first, keeping)
     last, shortfall = first, keeping.shortfall
@@ -154,7 +159,10 @@ def tighten(
         backoff = backoff + 1.1 * shortfall
         tighter = replace(request, backoff=tuple(backoff))
         found = again(tighter, last)
-        if found is None:
+        if found is None or any(
+            (assess(p, u[None])[0].missed > TOLERANCE).any()
+            for p, u in zip(problems, units(found), strict=True)
+        ):
             break
         now = keep_probability(request, units(found))
         last, shortfall = found, now.shortfall

@@ -14,7 +14,7 @@ from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import LIMITS, Circle, Circumstances, TrialLimits
 from experiment_design.excitation.schedule import make_schedule
 from experiment_design.feasibility.checks import feasible_or_reason
-from experiment_design.feasibility.constraint_satisfaction import keep_probability
+from experiment_design.feasibility.constraint_satisfaction import keep_probability, tighten
 from experiment_design.feasibility.least_violation import moved_constant
 from experiment_design.optimise.search import assess
 from experiment_design.request.request import build_problem
@@ -242,3 +242,30 @@ def test_models_that_all_run_away_keep_no_limit():
     assert found.probability == 0.0
     assert not found.shortfall.any()
     assert found.margins["u"] == -np.inf
+
+
+def test_tightening_gives_up_no_limit_that_was_asked_for():
+    """Margins kept more surely at the cost of the end state are no plan of this request."""
+    request = make_request(duration=60.0)
+    request = replace(request, covariance=np.diag((0.05 * request.theta) ** 2))
+    problem = build_problem(request)
+    drawn = np.random.default_rng(0).random((60, *problem.shape))
+    state = problem.scenarios[0].rollout.run(problem.schedule.expand(problem.levels(drawn))).state
+    sway = state[:, :, 1]
+    slow, fast = int(sway.min(axis=1).argmin()), int(sway.min(axis=1).argmax())
+    limits = TrialLimits(
+        margins={"u": 0.1, "v": float(sway[slow].min())}, end={"v": (float(sway[slow, -1]), 0.01)}
+    )
+    assert abs(sway[fast, -1] - sway[slow, -1]) > 0.02
+    asked = replace(request, limits=limits)
+    assert keep_probability(asked, [drawn[fast]]).probability > 0.9
+
+    def found(request):
+        return tighten(request, slow, lambda *_: fast, lambda which: [drawn[which]], 2)
+
+    tighter, chosen, keeping = found(asked)
+    assert chosen == slow
+    assert keeping.probability < 0.9
+    assert not tighter.backoff
+    free = replace(asked, limits=replace(limits, end={}))
+    assert found(free)[1] == fast
