@@ -24,6 +24,7 @@ from greybox.estimation.gls_regression import WhiteEquations
 from greybox.estimation.normal_equations import Solution, solve_stacked
 from greybox.estimation.registry import ESTIMATORS, Estimator
 from greybox.model.predictor import Predictor
+from greybox.model.run.step import Integrator
 from greybox.numerics.linalg import scaled_inverse
 from greybox.regression.instruments import Instruments
 from greybox.regression.regression import Regression
@@ -196,6 +197,8 @@ class Evidence:
         The equations of a refined estimate, with their error made white.
     information : tuple of ndarray, optional
         (p, p) Σ ẑ φᵀ of each equation, where the estimate rests on more samples than the logs.
+    integrator : {"euler", "rk4"}
+        Of the model's steps.
     """
 
     predictor: Predictor
@@ -212,6 +215,7 @@ class Evidence:
     solved: bool = True
     white: WhiteEquations | None = None
     information: tuple[Array, ...] | None = None
+    integrator: Integrator = "euler"
 
     @property
     def estimator(self) -> Estimator:

@@ -86,6 +86,7 @@ def evidence_of(fitted: Fitted, information: Sequence[Array] | None = None) -> E
         solved=solved is not None,
         white=fitted.white,
         information=None if information is None else tuple(information),
+        integrator=estimate.integrator,
     )
 
 

@@ -97,7 +97,13 @@ def noise_bias(evidence: Evidence) -> Array | None:
     theta = _structure_theta(evidence)
     for index, log in enumerate(evidence.logs):
         try:
-            run = simulate_log(predictor.structure, theta, log)
+            run = simulate_log(
+                predictor.structure,
+                theta,
+                log,
+                use_wind=predictor.air_measured,
+                integrator=evidence.integrator,
+            )
         except GreyboxError:
             return None
         if run.diverged[0] >= 0:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from greybox.credibility.evidence import Evidence
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.model.run.inputs import LogInputs
-from greybox.model.run.step import StepModel
+from greybox.model.run.step import Integrator, StepModel
 from greybox.numerics.linalg import scaled_root
 
 Array = NDArray[np.float64]
@@ -22,9 +22,13 @@ _POINTS, _DRAWS = 60, 200
 def stability(evidence: Evidence, seed: int = 0) -> TestResult:
     """Report the largest eigenvalue of ∂x⁺/∂x, and how likely the model is unstable.
 
-    The Jacobian is affine in the parameters, so draws from their covariance
-    cost an eigenvalue each. A draw counts as unstable where its median along
-    the motion is.
+    The Jacobian of a forward Euler step is affine in the parameters, so draws from their
+    covariance cost an eigenvalue each; for steady inputs that of a Runge-Kutta step is a
+    polynomial of it. A draw counts as unstable where its median along the motion is.
+
+    References
+    ----------
+    Hairer and Wanner (1996), section IV.2, stability function of order 4.
     """
     name, null = "stability", "the identified model is stable along the motion"
     predictor = evidence.predictor
@@ -38,7 +42,7 @@ def stability(evidence: Evidence, seed: int = 0) -> TestResult:
         return not_applicable(name, null, "the covariance of the estimate is not known")
     normal = np.random.default_rng(seed).standard_normal((_DRAWS, len(theta)))
     draws = theta + normal @ scaled_root(covariance).T
-    largest = _spectral_radius(constant, slopes, np.vstack([theta, draws]))
+    largest = _spectral_radius(constant, slopes, np.vstack([theta, draws]), evidence.integrator)
     here = largest[0]
     share = float((np.median(largest[1:], axis=1) > 1).mean())
     at = int(np.argmax(here))
@@ -99,12 +103,16 @@ def _affine_jacobian(evidence: Evidence, terms: list[int]) -> tuple[Array, Array
     return base, np.array(slopes), x.T
 
 
-def _spectral_radius(constant: Array, slopes: Array, theta: Array) -> Array:
-    """Return the largest modulus of the eigenvalues, (draws, K)."""
+def _spectral_radius(constant: Array, slopes: Array, theta: Array, integrator: Integrator) -> Array:
+    """Return the largest modulus of the eigenvalues of a step, (draws, K)."""
     matrices = constant + np.tensordot(theta, slopes, axes=1)
-    if matrices.shape[-1] == 1:
-        return np.abs(matrices[..., 0, 0])
-    return np.asarray(np.abs(np.linalg.eigvals(matrices)).max(axis=-1))
+    one = matrices.shape[-1] == 1
+    eigenvalues = matrices[..., 0] if one else np.linalg.eigvals(matrices)
+    if integrator == "rk4":
+        # a forward Euler step has 1 + z
+        z = eigenvalues - 1
+        eigenvalues = 1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24
+    return np.asarray(np.abs(eigenvalues).max(axis=-1))
 
 
 def damping_signs(evidence: Evidence) -> TestResult:

@@ -252,9 +252,11 @@ class DiagnosisBuilder:
 
     def _stands(self, rival: Candidate, without: Fit) -> bool:
         """Whether a rival, too, does more than a generic force."""
-        pairs = [self.case.held_out(f.integrator).pairs(f) for f in (rival.fit, without)]
+        with_it, less = (self.case.held_out(f.integrator).pairs(f) for f in (rival.fit, without))
         problem = self.case.problem(rival.fit.integrator)
-        return standing(problem, rival.hypothesis, rival.fit, *pairs, self.found.tried).stands
+        return standing(
+            problem, rival.hypothesis, rival.fit, with_it, less, self.found.tried
+        ).stands
 
     def gain(
         self,

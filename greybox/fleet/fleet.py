@@ -248,9 +248,10 @@ class Fleet(DisplayMixin):
                 f"(weather, draught, sensors) is in no standard error there, and may look like a "
                 f"difference between ships"
             )
-        reach = least_deviation(*self.pooled.theta.shape)
+        count = len(self.ships)
+        reach = least_deviation(count, len(self.names))
         told.append(
-            f"among {len(self.pooled.theta)} ships one coefficient must deviate by about "
+            f"among {count} ships one coefficient must deviate by about "
             f"{float(f'{reach:.2g}'):.0f} standard deviations before chance is "
             f"ruled out: a ship that is not named may still differ by less"
         )

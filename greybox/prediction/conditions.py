@@ -173,7 +173,8 @@ def driven(helm: Helm, model: ManoeuvringModel, asked: Conditions) -> Helm:
         given = _usual(helm, model, moved)
     if "" in given:
         common = given.pop("")
-        given = {n: math.copysign(common, helm.drive[helm.columns.index(n)]) for n in moved} | given
+        ahead = {n: math.copysign(1.0, helm.drive[helm.columns.index(n)]) for n in moved}
+        given = {n: common * way for n, way in ahead.items()} | given
     speeds = [n for n in helm.columns if n not in model.vessel.angle_commands]
     for name in given:
         if name not in speeds:

@@ -104,9 +104,9 @@ class Bundle:
         ``heading`` from the original one [rad], ``r`` [rad/s], ``speed`` [m/s], ``propeller``
         in the unit of the log, and ``steering`` [rad] where an angle steers, (N,).
     low, high : dict of str to ndarray
-        (N,) 95 % limits of the draws still under way, nan where half of them are not.
+        (N,) 95 % limits of the draws still under way, nan where more than half of them are not.
     tracks : tuple of (ndarray, ndarray)
-        North and east of some draws, the estimate's first [m].
+        Way ahead and to starboard of some draws, the estimate's first, from the order [m].
     """
 
     t: Array

@@ -42,7 +42,14 @@ def bundle_of(runs: DrawnRuns, helm: Helm, course: float, length: float) -> Bund
     if helm.angular:
         helms = int(np.flatnonzero(helm.steer)[0])
         signals["steering"] = np.sign(helm.steer[helms]) * runs.commands[k][:, helms][:, good]
-    tail = {n: np.quantile(v, [0.025, 0.975], axis=1) for n, v in signals.items()}
+    complete = runs.complete[good]
+    # what a draw does after its manoeuvre is no part of it
+    under_way = (complete < 0) | (k[:, None] <= complete)
+    few = under_way.mean(axis=1) < 0.5
+    tail = {}
+    for name, value in signals.items():
+        ends = np.nanquantile(np.where(under_way, value, np.nan), [0.025, 0.975], axis=1)
+        tail[name] = np.where(few, np.nan, ends)
     tracks = []
     for run in good[:_SHOWN_TRACKS]:
         last = int(runs.complete[run]) + 1 if runs.complete[run] >= 0 else stop

@@ -182,7 +182,7 @@ class Comparison(DisplayMixin):
                     f"{name[:23]:<24}{'mean':<26}" + "".join(f"{mean[s]:>12.1f}" for s in states)
                 )
         for name, aheads in zip(self.names, self.ahead, strict=True):
-            for horizon in aheads[0]:
+            for horizon in sorted(set().union(*aheads), key=float):
                 error = {
                     s: np.sqrt(np.mean([a[horizon][s] ** 2 for a in aheads if horizon in a]))
                     for s in states

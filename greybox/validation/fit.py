@@ -256,6 +256,7 @@ def run_from(
     steps: int,
     *,
     heading: Literal["measured", "simulated"] = "measured",
+    first: float = 0.0,
 ) -> Array:
     """Run a model from measured states of a log.
 
@@ -269,6 +270,8 @@ def run_from(
     steps : int
         After each; none may leave the log.
     heading : {"measured", "simulated"}
+    first : float
+        Time of the log's first sample on the clock of the model's changes [s].
 
     Returns
     -------
@@ -281,7 +284,7 @@ def run_from(
     window = starts[:, None] + np.arange(steps + 1)
     air = log.air if log.has_wind and structure.uses_air else None
     out = np.empty((len(starts), steps + 1, x.shape[1]))
-    begin = np.asarray(starts * log.sample_time, float)
+    begin = first + log.t[starts] - log.t[0]
     for rows in _alike(model.changes, begin, steps * log.sample_time):
         run = simulate(
             structure,

@@ -298,7 +298,7 @@ def _horizons(held: Sequence[HeldOut], spread: Array) -> Array:
             if steps < 1 or not len(starts):
                 continue
             sample_time = h.model.sample_time
-            x = run_from(h.model, log, starts, steps)
+            x = run_from(h.model, log, starts, steps, first=float(log.t[0] - h.run.log.t[0]))
             window = starts[:, None] + np.arange(steps + 1)
             error = np.where(known[window], (x - log.states(states)[window]) ** 2, 0.0)
             if len(total) < steps + 1:

@@ -16,15 +16,16 @@ from greybox.credibility.evidence import Evidence
 from greybox.credibility.excitation import combination
 from greybox.credibility.many import surplus_bias
 from greybox.credibility.margins import noise_bias
-from greybox.credibility.stability import damping_signs
+from greybox.credibility.stability import damping_signs, stability
 from greybox.credibility.verdict import holm, weigh
 from greybox.credibility.weak import measure_strength, threshold
 from greybox.errors import GreyboxError
 from greybox.estimation.verdict import BiasSource, LeastSquaresBias, TestResult, TrustLevel
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
+from greybox.model.run.step import StepModel
 from greybox.model.terms import parse_term
-from greybox.regression.instruments import build_instruments
+from greybox.regression.instruments import build_instruments, simulate_log
 from greybox.regression.regression import build_regression
 from greybox.selection.estimate import estimate_model
 from greybox.selection.fit_single import estimate_iv, estimate_ls
@@ -299,6 +300,47 @@ def test_noise_near_a_sign_change_biases_as_predicted():
     gap = np.abs(np.mean(found, axis=0) - np.mean(told, axis=0))
     assert (gap < 3 * error + 0.1 * np.abs(np.mean(told, axis=0))).all()
     assert np.abs(np.mean(found, axis=0)[1]) > 3 * error[1]
+
+
+def test_the_bias_by_noise_is_that_along_the_motion_in_the_wind(thesis, true_theta, monkeypatch):
+    log = virtual_log(70, 600, wind=10.0, current=(0.0, 0.0))
+    p = build_predictor(thesis, "wind", REGIME)
+    theta, runs = np.zeros(len(p.columns)), []
+    for i in p.parameter_columns:
+        theta[i] = true_theta[thesis.index(p.columns[i].terms[0])]
+    evidence = replace(evidence_of(p, [log], true_theta), theta=theta)
+
+    def kept(*given, **named):
+        runs.append(simulate_log(*given, **named))
+        return runs[-1]
+
+    monkeypatch.setattr("greybox.credibility.margins.simulate_log", kept)
+    noise_bias(evidence)
+    away = runs[0].x[0] - log.states(thesis.states)
+    # the sensors deviate by 0.014; in still air the model would be 0.2 and 0.3 m/s away
+    assert np.sqrt((away**2).mean(axis=0)).max() < 0.05
+
+
+def test_a_step_that_only_forward_euler_makes_unstable_is_stable(thesis):
+    """The eigenvalues are those of the model's own rule."""
+    p = build_predictor(get_structure("linear"), "basic", REGIME)
+    log = virtual_log(71, 200, wind=0.0, current=(0.0, 0.0))
+    values = {"Xu": -0.3, "Yv": -0.5, "Nr": -2.3}
+    theta = np.array([values.get(c.name, 0.0) for c in p.columns])
+    stable = {"Xu": -0.3, "Yv": -0.5, "Nr": -0.6}
+    begun = np.array([stable.get(n, 0.0) for n in p.structure.parameters])
+    evidence = replace(
+        evidence_of(p, [log], begun), theta=theta, covariance=1e-8 * np.eye(len(theta))
+    )
+    euler, rk4 = stability(evidence), stability(replace(evidence, integrator="rk4"))
+    assert euler.statistic == pytest.approx(1.3, abs=0.01)
+    assert not euler.passed
+    step = StepModel(p.structure, "rk4")
+    still = [np.zeros(3), 0.0, np.zeros(3), np.zeros(4), np.zeros(2)]
+    start = [values.get(n, 0.0) for n in p.structure.parameters]
+    exact = np.linalg.eigvals(np.array(step.jacobians(*still, start, 1.0)[0]))
+    assert rk4.statistic == pytest.approx(np.abs(exact).max(), abs=1e-3)
+    assert rk4.passed
 
 
 def test_surplus_instruments_are_told(thesis, true_theta):

@@ -98,6 +98,8 @@ def test_cautions_say_how_far_the_numbers_reach():
     # as the manual has it
     known = [least_deviation(units, 18) for units in (5, 10, 20)]
     np.testing.assert_allclose(known, [20, 7, 5], rtol=0.03)
+    # of three ships, one of which differs, two are left, between which there is no spread
+    assert "among 3 ships" in planted(3, odd=2000.0).cautions[-1]
     found = planted(3, 2)
     lost = replace(found.ships[0], fit={"u": -np.inf, "v": 3.0, "r": 4.0})
     fleet = replace(found, ships=(lost, *found.ships[1:]))

@@ -356,6 +356,24 @@ def test_wrong_uses_are_one_sentence(kind, asked, message):
         predict_manoeuvre(model, kind, **asked)
 
 
+def test_a_speed_astern_is_none_ahead():
+    with pytest.raises(InfeasibleError, match="no steady speed ahead at n = -4"):
+        predict_manoeuvre(rudder_model(speed_limits=[-5.0, 20.0]), "turning", command=-4.0)
+
+
+def test_bands_are_those_of_draws_under_way():
+    """Where the manoeuvre is over for most draws, nothing is drawn of what they do after it."""
+    made = predict_manoeuvre(
+        linear_ship(spread=0.3), "stopping", until=0.3, draws=80, command=12.0
+    ).manoeuvres[0]
+    low, high = made.bundle.low["speed"], made.bundle.high["speed"]
+    told = np.isfinite(low)
+    assert (np.isfinite(high) == told).all()
+    assert told[: len(told) // 2].all()
+    # no draw still under way is slower than where it ends, which is a share of its approach
+    assert low[told].min() > 0.25 * low[0]
+
+
 def test_what_a_crash_stop_needs():
     with pytest.raises(UsageError, match="states no least speed of n"):
         predict_manoeuvre(rudder_model(), "crash", command=12.0)

@@ -19,16 +19,18 @@ from greybox.estimation.output_setup import output_predictor
 from greybox.estimation.refined import estimate_refined_iv
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
+from greybox.model.run.changes import Change
+from greybox.model.run.simulation import simulate
 from greybox.regression.regression import build_regression
 from greybox.selection.estimate import estimate_model
 from greybox.selection.fit_single import estimate_iv, estimate_ls
 from greybox.selection.request import Request
 from greybox.selection.structures import compare_structures
 from greybox.trial.log import make_log
-from greybox.trial.segments import join_segments
+from greybox.trial.segments import join_segments, split_segments
 from greybox.validation.bands import predict_bands
-from greybox.validation.comparison import compare
-from greybox.validation.fit import fit_percent, run_model
+from greybox.validation.comparison import compare, errors_ahead
+from greybox.validation.fit import fit_percent, run_from, run_model
 from greybox.vessel.toml import load_vessel
 
 N = 400
@@ -54,6 +56,30 @@ def gapped(log):
     for name in ("u", "v", "r", "psi"):
         channels[name][GAP] = np.nan
     return make_log(log.vessel, channels, 1.0, "gapped")
+
+
+def test_changes_keep_their_time_behind_a_gap(log, true_model):
+    model = replace(true_model, changes=(Change("Xmu", 0.5, 300.0),))
+    start, tau = log.states(("u", "v", "r"))[0], log.forces(model.structure.inputs)
+    run = simulate(
+        model.structure, model.theta, start, tau[:-1], 1.0, psi=log["psi"], changes=model.changes
+    )
+    own = {n: run.x[0][:, i] for i, n in enumerate(("u", "v", "r"))}
+    still = {n: a for n, a in log.channels.items() if n not in ("u_q", "v_q")}
+    whole = replace(log, channels=still | own)
+    joined = join_segments([whole.window(0, 100, "a"), whole.window(200, N, "b")], "gap")
+    for ahead in errors_ahead(model, run_model(model, joined)).values():
+        assert max(ahead.values()) < 1e-9
+    later = split_segments(joined)[1]
+    seen = run_from(model, later, np.array([50]), 60, first=200.0)[0]
+    np.testing.assert_allclose(seen, run.x[0][250:311], atol=1e-9)
+
+
+def test_all_horizons_are_told_whichever_log_comes_first(log, true_model):
+    logs = [log.window(0, 30, "short"), log.window(30, N, "long")]
+    found = compare({"true": true_model}, logs, bands=False).summary()
+    told = [line for line in found.splitlines() if " s ahead" in line]
+    assert [line.split()[1] for line in told] == ["10", "30", "60"]
 
 
 def otherwise_bridged(log):
