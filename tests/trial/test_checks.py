@@ -290,6 +290,16 @@ def test_times_that_repeat_and_go_back(ship):
     assert "1 repeats the one before and 1 goes back" in f["duplicate_time"].evidence
 
 
+@pytest.mark.parametrize("name", ["psi", "cog"])
+def test_degrees_show_where_nothing_else_tells_the_heading(name, ship):
+    t = np.arange(300.0)
+    turning = np.degrees(0.02 * t + 2) % 360
+    d = {"t": t, "x_n": 3 * t, "y_n": 0.1 * t} if name == "psi" else {"t": t, "sog": 4 + 0 * t}
+    (found,) = check_recording(as_recording(d | {name: turning}), ship).findings
+    assert (found.id, found.channels, found.safe) == ("unit", (name,), True)
+    assert not check_recording(as_recording(d | {name: np.radians(turning)}), ship).findings
+
+
 @pytest.mark.parametrize("offset", [0.0, 0.13])
 def test_two_runs_in_one_file_are_found_and_not_mended(offset, ship):
     one, two = recorded(3, 2.0, seconds=100), recorded(4, 2.0, seconds=100)

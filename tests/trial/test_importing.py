@@ -384,6 +384,24 @@ def test_columns_n_and_e_of_a_file_of_any_size(tmp_path, monkeypatch, cells, hel
     assert ("x_n" in pd.read_csv(tmp_path / "log.csv")) is not held
 
 
+@pytest.mark.parametrize("cells", [20_000_000, 0])
+def test_positions_of_a_file_of_any_size_begin_at_the_first_place_on_earth(
+    tmp_path, monkeypatch, cells
+):
+    t = np.arange(400) * 0.5
+    table = pd.DataFrame({"t": t, "lat": 63.4 + 1e-5 * t, "lon": 10.4, "psi": 0 * t, "n": 5.0})
+    table.loc[:2, ["lat", "lon"]] = 91.0, 181.0
+    table.to_csv(tmp_path / "raw.csv", index=False)
+    vessel = vessel_from_dict(
+        {"name": "S", "length": 30, "thruster": [{"type": "fixed", "speed": "n"}]}
+    )
+    monkeypatch.setattr(stream, "_LARGE_CELLS", cells)
+    import_files([tmp_path / "raw.csv"], vessel, tmp_path / "log.csv")
+    north = pd.read_csv(tmp_path / "log.csv")["x_n"]
+    assert north.abs().min() < 2
+    assert north.max() == pytest.approx(1e-5 * 198 * 111_000, rel=0.02)
+
+
 def test_a_large_file_whose_time_starts_again(tmp_path, monkeypatch):
     table = large("plain")
     pd.concat([table, table]).to_csv(tmp_path / "raw.csv", index=False)

@@ -17,6 +17,7 @@ from greybox.trial.checks.position_hold import hold_findings
 from greybox.trial.checks.position_jump import jump_findings
 from greybox.trial.checks.signal_quality import coarse_findings, spike_findings
 from greybox.trial.convert.convert import import_recording
+from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs
 from greybox.trial.trial_summary import describe_recording
@@ -91,6 +92,16 @@ def test_a_heading_resampled_before_it_was_unwrapped(ship):
     assert wrong
     assert wrong <= set(between(t, found))
     assert off[between(t, found)].min() > np.radians(0.9)
+
+
+@pytest.mark.parametrize("glitch", [99.0, -9.99])
+def test_one_glitch_leaves_the_rest_of_a_heading_unwrapped(glitch):
+    psi = 0.025 * np.arange(400)
+    at = wrapped(psi, -np.pi)
+    at[37] = glitch
+    rest = np.arange(400) != 37
+    np.testing.assert_allclose(continuous(at)[rest], psi[rest], atol=1e-12)
+    assert continuous(at)[37] == glitch
 
 
 def test_a_fast_turn_the_long_way_round_is_no_wrap():

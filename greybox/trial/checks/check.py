@@ -204,9 +204,9 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
     raw = time_format_findings(recording)
     raw += time_findings(apply_repairs(recording, raw))
     raw += missing_findings(recording)
-    raw += angle_unit_findings(recording, vessel)
     # before the heading is unwrapped
     raw += wrap_findings(first_run(apply_repairs(recording, raw)))
+    raw += angle_unit_findings(recording, vessel)
     whole = derive_signals(first_run(apply_repairs(recording, raw)))
     log = _Log(recording, raw, {}, whole)
     log.add(hold_findings(_independent(whole)))

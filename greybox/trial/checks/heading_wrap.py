@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from greybox.numerics.robust import robust_deviation
 from greybox.trial.checks.finding import Finding
 from greybox.trial.checks.signal_quality import quantum
+from greybox.trial.convert.derived_signals import usual_reach
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import mend
 
@@ -52,7 +53,7 @@ def wrap_findings(recording: Recording) -> list[Finding]:
     t, value = s.t[keep], s.value[keep]
     if len(value) < 10:
         return []
-    whole = 360.0 if np.abs(value).max() > _DEGREES else 2 * np.pi
+    whole = 360.0 if usual_reach(value) > _DEGREES else 2 * np.pi
     between = _between(t, value * (2 * np.pi / whole))
     if not len(between):
         return []

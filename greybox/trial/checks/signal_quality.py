@@ -537,14 +537,19 @@ def _moves(name: str, start: float, stop: float, signals: list[Signal], step: fl
 
 
 def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
-    """Find degrees under a radian name by range: angles of wind and thrusters."""
+    """Find degrees under a radian name by the range of each angle, of a heading by its wraps."""
     found = []
     for s in recording.signals:
-        if s.name not in (ANGLES | vessel.recorded_angles) - {"psi", "cog"}:
+        if s.name not in ANGLES | vessel.recorded_angles:
             continue
         if beyond := beyond_reach(s, vessel):
             largest, limit = beyond
             factor = float(np.pi / 180)
+            why = (
+                "and steps by 360 where it passes a full turn"
+                if s.name == "psi"
+                else f"above the {limit:.3g} rad that it can reach"
+            )
             found.append(
                 Finding(
                     "unit",
@@ -552,8 +557,8 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
                     180 / np.pi,
                     (180 / np.pi, 180 / np.pi),
                     "deg per rad",
-                    f"{s.name} reaches {largest:.4g}, above the {limit:.3g} rad that it can "
-                    f"reach: it holds degrees where a log has radians",
+                    f"{s.name} reaches {largest:.4g}, {why}: it holds degrees where a log has "
+                    f"radians",
                     declare_unit((s.name,), "deg"),
                     (s.name,),
                     (mend("scale", (s.name,), factor=factor),),

@@ -15,6 +15,7 @@ from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.column_names import Assigned, assign, is_short_pair
+from greybox.trial.convert.derived_signals import usual_reach, wraps_by_degrees
 from greybox.trial.convert.file_clocks import on_one_clock
 from greybox.trial.convert.merge import merge
 from greybox.trial.convert.settle_axes import settle_axes
@@ -402,11 +403,13 @@ def angle_unit(reach: tuple[float, float]) -> str:
 
 def beyond_reach(signal: Signal, vessel: Vessel) -> tuple[float, float] | None:
     """Return how far an angle reaches and how far it can [rad], where it is beyond."""
-    finite = np.abs(signal.value[np.isfinite(signal.value)])
+    finite = signal.value[np.isfinite(signal.value)]
     if len(finite) < 3:
         return None
-    # single glitches tell nothing of the unit
-    largest = float(np.quantile(finite, 0.98))
+    largest = usual_reach(finite)
+    if signal.name == "psi" and not wraps_by_degrees(finite):
+        # an unwrapped heading has no limit
+        return None
     # no rudder passes a right angle, no wrapped angle two turns
     limit = np.pi / 2 if signal.name in vessel.rudders else 4 * np.pi
     return (largest, limit) if largest > limit else None

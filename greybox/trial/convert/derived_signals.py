@@ -34,6 +34,8 @@ _POLAR = (
     ("V_w", "dir_w", ("w_n", "w_e")),
     ("V_w", "dir_t", ("w_x", "w_y")),
 )
+# how far wrapped radians reach, and the noise of a sensor
+_TURN = 2 * np.pi + 0.5
 # order of the polynomials of positions: the velocity may bend within the window
 _ORDER = 3
 _SMOOTHING_ORDER = 2
@@ -64,7 +66,7 @@ def derive_signals(recording: Recording, origin: tuple[float, float] | None = No
     steps: list[Step] = []
     if "lat" in signals and "lon" in signals:
         lat, lon = signals.pop("lat"), signals.pop("lon")
-        if not {"x_n", "y_n"} <= signals.keys() and np.isfinite(_places(lat, lon)[1]).any():
+        if not {"x_n", "y_n"} <= signals.keys() and np.isfinite(places(lat, lon)[1]).any():
             north, east, zero = local_positions(lat, lon, origin)
             signals["x_n"], signals["y_n"] = north, east
             place = {"lat": zero[0], "lon": zero[1]}
@@ -94,7 +96,7 @@ def local_positions(
     """
     import pymap3d
 
-    t, phi, lam = _places(lat, lon)
+    t, phi, lam = places(lat, lon)
     if origin is None:
         k = int(np.flatnonzero(np.isfinite(phi))[0])
         origin = (float(phi[k]), float(lam[k]))
@@ -108,7 +110,7 @@ def local_positions(
     )
 
 
-def _places(lat: Signal, lon: Signal) -> tuple[Array, Array, Array]:
+def places(lat: Signal, lon: Signal) -> tuple[Array, Array, Array]:
     """Return times, latitude and longitude [deg], NaN for both where they are no place on earth."""
     t, phi, lam = _paired(lat, lon)
     known = (np.abs(phi) <= 90) & (np.abs(lam) <= 360)
@@ -126,17 +128,30 @@ def unwrapped(signal: Signal) -> Signal:
 def continuous(angle: Array) -> Array:
     """Return an angle without its wraps, be they of 2π or, under a wrong name, of 360.
 
-    What is beyond a turn already has been unwrapped before, or holds degrees:
-    it is left as it is.
+    What is beyond a turn already has been unwrapped before, or holds degrees: it is left as it
+    is. So are single glitches beyond a turn among wrapped values.
     """
     if not len(angle):
         return angle
-    jumps = np.abs(np.diff(angle))
-    if np.any((jumps > 300) & (jumps < 361)):
+    if wraps_by_degrees(angle):
         return np.asarray(np.unwrap(angle, period=360.0))
-    if np.abs(angle).max() > 2 * np.pi + 0.5:
+    if usual_reach(angle) > _TURN:
         return angle
-    return np.asarray(np.unwrap(angle))
+    glitch = np.abs(angle) > _TURN
+    out = angle.astype(float)
+    out[~glitch] = np.unwrap(angle[~glitch])
+    return out
+
+
+def wraps_by_degrees(angle: Array) -> bool:
+    """Whether an angle, each value a number, steps by 360 where it passes a full turn."""
+    jumps = np.abs(np.diff(angle))
+    return bool(np.any((jumps > 300) & (jumps < 361)))
+
+
+def usual_reach(angle: Array) -> float:
+    """Return the largest size of an angle, each value a number, single glitches left out."""
+    return float(np.quantile(np.abs(angle), 0.98))
 
 
 def _paired(a: Signal, b: Signal) -> tuple[Array, Array, Array]:

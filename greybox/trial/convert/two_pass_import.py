@@ -38,7 +38,7 @@ from greybox.trial.convert.convert import (
     make_provenance,
 )
 from greybox.trial.convert.deduplicate import clean_signals
-from greybox.trial.convert.derived_signals import continuous, derive_signals
+from greybox.trial.convert.derived_signals import continuous, derive_signals, places
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.resample import clock
 from greybox.trial.convert.time_grid import Extent, Plan, extent, gap_notes, plan_import
@@ -279,8 +279,8 @@ def _head(recording: Recording, rows: int) -> Recording:
 def _first_position(recording: Recording) -> tuple[float, float] | None:
     if "lat" not in recording or "lon" not in recording:
         return None
-    lat, lon = recording["lat"].value, recording["lon"].value
-    good = np.flatnonzero(np.isfinite(lat) & np.isfinite(lon))
+    _, lat, lon = places(recording["lat"], recording["lon"])
+    good = np.flatnonzero(np.isfinite(lat))
     return (float(lat[good[0]]), float(lon[good[0]])) if len(good) else None
 
 
