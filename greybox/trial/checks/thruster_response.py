@@ -7,7 +7,7 @@ only where that explains the motion far better than the columns as they are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
@@ -80,7 +80,7 @@ def response_findings(
     ]
     if len(commands) < len(vessel.commands):
         return []
-    motion = make_motion(recording, _STATES)
+    motion = _turning_motion(recording)
     if motion is None:
         return []
     inputs = {c: _held(recording, c, motion.t) for c in commands}
@@ -124,6 +124,25 @@ def response_findings(
             _picture(motion, vessel, inputs, _as_read(inputs, a)),
         )
     ]
+
+
+def _turning_motion(recording: Recording) -> Motion | None:
+    """Return the velocities with their yaw rate, None where nothing tells how the ship turns.
+
+    Sway answers the yaw rate: without it the yaw moment of the thrusters would be taken for a
+    side force.
+    """
+    if "r" in recording or "psi" not in recording:
+        motion = make_motion(recording, _STATES)
+        return motion if motion is not None and "r" in motion else None
+    motion = make_motion(recording, ("u", "v", "psi"))
+    if motion is None or "psi" not in motion:
+        return None
+    psi, rate = denoise(motion["psi"], motion), np.empty(len(motion))
+    for a, b in motion.stretches:
+        rate[a:b] = np.gradient(psi[a:b], motion.step)
+    values = {s: motion[s] for s in ("u", "v") if s in motion}
+    return replace(motion, values=values | {"r": rate})
 
 
 def _picture(
