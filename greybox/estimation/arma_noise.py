@@ -228,7 +228,8 @@ def _fit(series: Array, inside: NDArray[np.bool_], ar: int, ma: int) -> tuple[AR
     found = least_squares(innovations, start, method="trf", x_scale=1.0, max_nfev=40, xtol=1e-4,
                           ftol=1e-6)  # fmt: skip
     best = colour(found.x)
-    spread = np.linalg.pinv(found.jac.T @ found.jac) * 2 * found.cost / max(len(series), 1)
+    freedom = max(int(inside.sum()) - ar - ma, 1)
+    spread = np.linalg.pinv(found.jac.T @ found.jac) * 2 * found.cost / freedom
     values, vectors = np.linalg.eigh(spread)
     axes = (vectors * np.sqrt(np.maximum(values, 0.0))).T
     return replace(best, neighbours=tuple(colour(found.x + axis) for axis in axes)), float(

@@ -483,6 +483,9 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
         )
     own = predictor.structure.states
     errors = np.vstack([one_step_errors(model, log, fit.p) for log in data])
+    # bridged samples are no errors of a step
+    measured_both = np.concatenate([d.known[:-1] & d.known[1:] for d in data])
+    errors = errors[measured_both] if measured_both.any() else errors
     notes = []
     held = [n for n, b in zip(model.parameters, bound, strict=True) if b]
     if held:

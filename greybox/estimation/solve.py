@@ -429,6 +429,12 @@ def samples_kept(rows: Array, keep: NDArray[np.bool_]) -> Array:
     return rows if keep.all() else rows[..., keep]
 
 
+def _less_mean(rows: Array, keep: NDArray[np.bool_]) -> Array:
+    """Return rows (..., N) less their mean over the samples that take part."""
+    part = samples_kept(rows, keep)
+    return np.asarray(rows - part.mean(axis=-1, keepdims=True)) if part.size else rows
+
+
 def largest_of(rows: Array, keep: NDArray[np.bool_]) -> Array:
     """Return the largest size of each of the rows (p, N) at the samples that take part, (p,)."""
     return np.asarray(np.abs(samples_kept(rows, keep)).max(axis=1, initial=0.0))
@@ -513,8 +519,10 @@ def _covariance(
             y = [e.y[row] for e in regression.experiments]
             if solved.centred:
                 # the constant of each experiment belongs to the equation, not to a block
-                phi = [f - f.mean(axis=1, keepdims=True) for f in phi]
-                y = [v - v.mean() for v in y]
+                phi, y = (
+                    [_less_mean(rows, k) for rows, k in zip(every, solved.keep, strict=True)]
+                    for every in (phi, y)
+                )
             equations.append((projected[row], phi, y))
         draws = block_bootstrap(equations, np.random.default_rng(seed))
         order = np.argsort(

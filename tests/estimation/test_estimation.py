@@ -20,6 +20,7 @@ from greybox.estimation.covariance import (
 from greybox.estimation.disturbance import estimate_current
 from greybox.estimation.normal_equations import solve_stacked
 from greybox.estimation.problem import Fitted
+from greybox.estimation.solve import _less_mean
 from greybox.model.catalogue import get_structure
 from greybox.model.predictor import build_predictor
 from greybox.regression.instruments import build_instruments
@@ -194,6 +195,13 @@ def test_bootstrap_agrees_with_the_moving_average(thesis, noisy_log, nominal_the
     ratio = two.std[wanted] / one.std[wanted]
     assert 0.6 < np.median(ratio) < 1.6
     assert (ratio < 4).all()
+
+
+def test_the_centre_of_an_equation_is_that_of_the_samples_that_take_part():
+    keep = np.array([True, True, False])
+    np.testing.assert_array_equal(_less_mean(np.array([[1.0, 2.0, 9.0]]), keep), [[-0.5, 0.5, 7.5]])
+    # what is cut out everywhere counts nowhere
+    np.testing.assert_array_equal(_less_mean(np.ones((1, 3)), ~keep & keep), np.ones((1, 3)))
 
 
 def test_bootstrap_of_white_noise_has_the_known_spread():

@@ -280,6 +280,22 @@ def test_noise_model_equals_statsmodels():
     assert fit_arma_noise([rng.normal(size=2000)], [np.ones(2000, bool)]) == WHITE
 
 
+def test_the_noise_model_of_many_stretches_is_known_as_well_as_it_is():
+    """Missing samples between them are none: Kalman's filter passes over them."""
+    rng = np.random.default_rng(12)
+    white = rng.normal(size=2000)
+    series = np.zeros(2000)
+    for k in range(1, 2000):
+        series[k] = -0.6 * series[k - 1] + white[k]
+    keep = np.arange(2000) % 30 < 22
+    found = fit_arma_noise([series], [keep])
+    oracle = sm.tsa.ARIMA(np.where(keep, series, np.nan), order=(1, 0, 0), trend="n").fit()
+    (beside,) = found.neighbours
+    own = abs(beside.autoregression[1] - found.autoregression[1])
+    assert len(found.autoregression) == 2
+    assert own == pytest.approx(oracle.bse[0], rel=0.1)
+
+
 def test_adjoint_and_innovations_are_one_operator():
     rng = np.random.default_rng(11)
     white = rng.normal(size=501)

@@ -111,6 +111,7 @@ def test_no_fit_counts_what_was_not_measured(gapped, method):
             # the step into the gap and that out of it hold one measurement only
             assert found[-1].kept == N - 1 - 31
     np.testing.assert_allclose(found[0].theta, found[1].theta, rtol=1e-6)
+    np.testing.assert_allclose(found[0].residual_std, found[1].residual_std, rtol=1e-6)
 
 
 def test_augmented_rows_need_the_heading_too(log):
