@@ -17,6 +17,7 @@ from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.actuator_delay import late_notes
 from experiment_design.feasibility.checks import (
     feasible_or_reason,
+    missed_targets,
     require_horizon,
     require_informative,
     require_stable,
@@ -25,7 +26,7 @@ from experiment_design.feasibility.checks import (
 )
 from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
-    tighten,
+    tightened_campaign,
 )
 from experiment_design.feasibility.least_violation import closest, moved_constant, perturbed
 from experiment_design.information.moments import MomentProgram
@@ -56,12 +57,8 @@ from greybox.trial.plan_parts import LEAD_IN, TRIAL
 
 Array = NDArray[np.float64]
 
-# rounds of tightening limits until they are kept with the wanted probability
-_TIGHTENINGS = 5
 # scaled units from which a limit counts as active; iterations and seconds of the polish
 _NEAR, _POLISH, _PATIENCE = 0.1, 40, 3600.0
-# share of the effort that a design after a tightening gets
-_AGAIN = 0.4
 
 _log = logging.getLogger(__name__)
 
@@ -188,7 +185,9 @@ def _design(
     keeping: ConstraintSatisfaction | None = None
     if request.uncertain and not stopped:
         try:
-            request, candidates, keeping, more = _tighten(request, problems, candidates, workers)
+            request, candidates, keeping, more = tightened_campaign(
+                request, problems, candidates, effort=request.effort, workers=workers
+            )
             evaluations += more
         except KeyboardInterrupt:
             stopped = True
@@ -204,6 +203,7 @@ def _design(
         raise InfeasibleError(unexcited(problems, units, request))
     if not missing or not best_effort:
         notes += require_informative(request, problems, units)
+    notes += missed_targets(request, problems, units)
     certificate = absent("the user stopped the design")
     if not stopped:
         try:
@@ -405,38 +405,6 @@ def _criterion_value(
     # of a parameter that the trial does not tell the covariance is infinite
     with np.errstate(invalid="ignore"):
         return float(criterion.of_covariance(covariance[None])[0])
-
-
-def _tighten(
-    request: PreparedRequest,
-    problems: list[TrialProblem],
-    candidates: list[Candidate],
-    workers: int | None,
-) -> tuple[PreparedRequest, list[Candidate], ConstraintSatisfaction, int]:
-    """Tighten the path limits until they are kept with the wanted probability."""
-    spent = 0
-
-    def again(tighter: PreparedRequest, last: list[Candidate]) -> list[Candidate] | None:
-        nonlocal spent
-        found = search_campaign(
-            tighter,
-            [build_problem(tighter, t) for t in range(request.trials)],
-            [c.unit for c in last],
-            effort=_AGAIN * request.effort,
-            workers=workers,
-            quick=True,
-        )
-        spent += found.evaluations
-        kept = all(np.isfinite(c.value) for c in found.candidates)
-        return list(found.candidates) if kept else None
-
-    tighter, found, keeping = tighten(
-        request, candidates, again, lambda found: [c.unit for c in found], _TIGHTENINGS
-    )
-    if found is not candidates:
-        # what is reported is measured against the limits as they were asked for
-        candidates = [assess(p, c.unit[None])[0] for p, c in zip(problems, found, strict=True)]
-    return tighter, candidates, keeping, spent
 
 
 def _margins(problems: list[TrialProblem], motions: tuple[Motion, ...]) -> dict[str, float]:

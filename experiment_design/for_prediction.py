@@ -306,9 +306,7 @@ def _design(
     if kept_starts:
         asked = after_lead_in(asked)
     before = log_moments(found, sailed)
-    searches, keeping = tightened_search(
-        asked, lambda r: _campaign(r, found, before, workers)
-    )
+    searches, keeping = tightened_search(asked, lambda r: _campaign(r, found, before, workers))
     design = described_plan(
         asked, searches, keeping, kept_starts=kept_starts, began=began,
         certificate="a plan for prediction has no bound to be measured against",

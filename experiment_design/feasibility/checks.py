@@ -97,6 +97,21 @@ def require_informative(
     ]
 
 
+def missed_targets(
+    request: PreparedRequest, problems: list[TrialProblem], units: list[Array]
+) -> list[str]:
+    """Return a note on each wanted standard error that sequences do not reach."""
+    if not request.targets:
+        return []
+    reached = zip(request.wanted, std_of(problems, units), request.targets, strict=True)
+    return [
+        f"the standard error of {n} is {s:.3g} and {target:.3g} was wanted: ask for --target "
+        f"{n}={target**2 / s:.2g}, or for limits that leave more room"
+        for n, s, target in reached
+        if s > target
+    ]
+
+
 def require_start(problem: TrialProblem, request: PreparedRequest, trial: int) -> None:
     """Raise where the start itself breaks a limit."""
     program = problem.scenarios[0].limits

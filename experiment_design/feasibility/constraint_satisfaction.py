@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from experiment_design.constraints.kinds.margin import Margin
 from experiment_design.constraints.limits import TOLERANCE
 from experiment_design.excitation.rollout import Rollout
-from experiment_design.optimise.search import assess
+from experiment_design.optimise.campaign import search_campaign
+from experiment_design.optimise.search import Candidate, assess
+from experiment_design.request.problem import TrialProblem
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.numerics.binomial import wilson_interval
 
@@ -21,6 +23,8 @@ Array = NDArray[np.float64]
 Found = TypeVar("Found")
 
 _DRAWS = 400
+# rounds of tightening the limits of a campaign, and the share of the effort that each gets
+_TIGHTENINGS, _AGAIN = 5, 0.4
 
 
 @dataclass(frozen=True)
@@ -169,6 +173,58 @@ def tighten(
         if now.probability > best[2].probability:
             best = (tighter, found, now)
     return best
+
+
+def tightened_campaign(
+    request: PreparedRequest,
+    problems: list[TrialProblem],
+    candidates: list[Candidate],
+    *,
+    effort: float,
+    workers: int | None = None,
+) -> tuple[PreparedRequest, list[Candidate], ConstraintSatisfaction, int]:
+    """Search a campaign again with tighter path limits; see `tighten`.
+
+    Parameters
+    ----------
+    request : PreparedRequest
+    problems : list of TrialProblem
+        One per trial, with the limits as they were asked for.
+    candidates : list of Candidate
+        What was found with them.
+    effort : float
+        Of the search that found them.
+    workers : int, optional
+        Processes.
+
+    Returns
+    -------
+    tuple
+        The request of the search that keeps the limits best, what it found, measured against the
+        limits as they were asked for, how it keeps them, and the evaluations.
+    """
+    spent = 0
+
+    def again(tighter: PreparedRequest, last: list[Candidate]) -> list[Candidate] | None:
+        nonlocal spent
+        found = search_campaign(
+            tighter,
+            [build_problem(tighter, t) for t in range(request.trials)],
+            [c.unit for c in last],
+            effort=_AGAIN * effort,
+            workers=workers,
+            quick=True,
+        )
+        spent += found.evaluations
+        kept = all(np.isfinite(c.value) for c in found.candidates)
+        return list(found.candidates) if kept else None
+
+    tighter, found, keeping = tighten(
+        request, candidates, again, lambda found: [c.unit for c in found], _TIGHTENINGS
+    )
+    if found is not candidates:
+        candidates = [assess(p, c.unit[None])[0] for p, c in zip(problems, found, strict=True)]
+    return tighter, candidates, keeping, spent
 
 
 def _quantile(values: Array, share: float, otherwise: float) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.excitation.schedule import MOST_SAMPLES
+from experiment_design.feasibility.constraint_satisfaction import tightened_campaign
 from experiment_design.optimise.campaign import (
     Progress,
     random_campaign,
@@ -84,7 +85,9 @@ def least_duration(
     Returns
     -------
     PreparedRequest
-        Of the least duration, in whole holds, with the A criterion scaled by the targets.
+        Of the least duration, in whole holds, with the A criterion scaled by the targets; of the
+        longest where no sequence was found that keeps its limits, so that `design_trial` says
+        which one stops it.
 
     Raises
     ------
@@ -98,30 +101,44 @@ def least_duration(
             raise UsageError(f"the target of {name} is {value:g}, it must be positive.")
     request = after_lead_in(request)
     predictor = request.build_predictor()
-    names = tuple(predictor.columns[i].name for i in wanted_columns(predictor, tuple(targets)))
-    wanted = replace(request, criterion="A", wanted=names, targets=tuple(targets.values()))
-    goal = np.array(list(targets.values()))
+    # of two names of one column the one with the smaller target
+    told: dict[int, str] = {}
+    for name in targets:
+        (column,) = wanted_columns(predictor, (name,))
+        told[column] = min(told.get(column, name), name, key=targets.__getitem__)
+    goal = np.array([targets[n] for n in told.values()])
+    wanted = replace(
+        request, criterion="A", wanted=tuple(predictor.columns[i].name for i in told),
+        targets=tuple(goal.tolist()),
+    )  # fmt: skip
+    effort = _QUICK * request.effort
     tried = [0]
 
     def reached(duration: float) -> tuple[float, int]:
         trial = replace(wanted, duration=duration)
         problems = [build_problem(trial, t) for t in range(trial.trials)]
         start, _ = random_campaign(problems, trial.seed)
-        found = search_campaign(
-            trial, problems, start, effort=_QUICK * request.effort, workers=workers
-        )
+        found = search_campaign(trial, problems, start, effort=effort, workers=workers)
         tried[0] += 1
         if progress is not None:
             progress(min(tried[0], 14), 15)
-        if not all(c.feasible for c in found.candidates) and trial.trials == 1:
+        candidates = list(found.candidates)
+        if not all(c.feasible for c in candidates):
             return np.inf, 0
-        ratio = std_of(problems, [c.unit for c in found.candidates]) / goal
+        if trial.uncertain:
+            # sequences that keep the limits surely tell less
+            _, candidates, _, _ = tightened_campaign(
+                trial, problems, candidates, effort=effort, workers=workers
+            )
+        ratio = std_of(problems, [c.unit for c in candidates]) / goal
         return float(ratio.max()), int(ratio.argmax())
 
     longest = request.duration
     ratio, worst = reached(longest)
+    if ratio == np.inf:
+        return replace(wanted, duration=longest)
     if ratio > 1:
-        name = list(targets)[worst]
+        name = list(told.values())[worst]
         raise InfeasibleError(
             f"{longest:g} s do not reach the target: the standard error of {name} would be "
             f"{ratio:.2g} times the {targets[name]:.3g} that is wanted. Allow about "

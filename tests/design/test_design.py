@@ -20,7 +20,9 @@ from experiment_design import (
     prepare_request,
 )
 from experiment_design.excitation.inputs import multisines, prbs, random_two_level, zig_zags
-from experiment_design.optimise.search import assess, best_random, exchange
+from experiment_design.feasibility.checks import missed_targets
+from experiment_design.optimise.campaign import Found, std_of
+from experiment_design.optimise.search import assess, best_random, exchange, to_unit
 from experiment_design.request.expressions import gradient_of
 from experiment_design.request.regimes import parse_regime, spell_regime
 from experiment_design.request.request import build_problem
@@ -287,6 +289,79 @@ def test_least_trial_time():
         least_duration(request, {"Yvv": 1e-4}, workers=1)
     with pytest.raises(UsageError, match="must be positive"):
         least_duration(request, {"Yvv": 0.0}, workers=1)
+
+
+@pytest.mark.long
+def test_a_target_is_reached_by_what_keeps_the_limits_surely():
+    """A target of what keeps them under the nominal prior alone would be missed twofold."""
+    uncertain = np.diag((0.2 * np.abs(make_request().theta)) ** 2)
+    limits = TrialLimits(margins={"u": 0.5, "v": 0.7})
+    request = make_request(duration=120.0, effort=0.02, covariance=uncertain, limits=limits)
+    shorter = least_duration(request, {"Yvv": 0.045}, workers=1)
+    design = design_trial(shorter, workers=1, alternatives=False)
+    assert design.keeping.probability >= 0.9
+    assert design.std[0] <= 0.045 * 1.03
+
+
+def test_a_target_is_judged_after_the_tightening(monkeypatch):
+    uncertain = np.diag((0.2 * np.abs(make_request().theta)) ** 2)
+    request = make_request(duration=30.0, effort=0.01, covariance=uncertain)
+    problem = build_problem(replace(request, wanted=("Yvv",), criterion="A", targets=(1.0,)))
+    drawn = assess(problem, np.random.default_rng(0).random((20, *problem.shape)))
+    safe = min(drawn, key=lambda c: c.value)
+    monkeypatch.setattr(
+        "experiment_design.optimise.duration.tightened_campaign",
+        lambda request, *_, **__: (request, [safe], None, 0),
+    )
+    std = std_of([problem], [safe.unit])[0]
+    with pytest.raises(InfeasibleError, match=r"Yvv would be 1\.2 times the"):
+        least_duration(request, {"Yvv": std / 1.2}, workers=1)
+    assert least_duration(request, {"Yvv": 1.01 * std}, workers=1).duration == 30
+
+
+def test_a_target_that_the_plan_misses_is_told(good):
+    request = replace(good.request, wanted=("Yvv",), criterion="A", targets=(0.01,))
+    problem = build_problem(request)
+    units = [to_unit(problem, good.levels[0])]
+    std = std_of([problem], units)[0]
+    (note,) = missed_targets(request, [problem], units)
+    assert f"the standard error of Yvv is {std:.3g} and 0.01 was wanted" in note
+    assert missed_targets(replace(request, targets=(std,)), [problem], units) == []
+    assert missed_targets(good.request, [problem], units) == []
+
+
+def test_two_names_of_one_column_are_one_target():
+    request = make_request(duration=30.0, effort=0.01)
+    found = least_duration(request, {"Wuu": 8.0, "Yvv": 9.0, "Xuu": 7.0}, workers=1)
+    assert found.wanted == ("Xuu", "Yvv")
+    assert found.targets == (7.0, 9.0)
+    with pytest.raises(InfeasibleError, match="the standard error of Wuu would be"):
+        least_duration(request, {"Xuu": 1.0, "Wuu": 1e-9}, workers=1)
+
+
+def test_a_target_beside_limits_that_cannot_be_kept(monkeypatch):
+    """The design says which limit it is, or gives its closest plan."""
+
+    def out_of_reach(request, problems, *_, **__):
+        missed = [assess(p, np.full((1, *p.shape), 0.5))[0] for p in problems]
+        return Found(tuple(replace(c, missed=c.missed + 1) for c in missed), 1, False)
+
+    monkeypatch.setattr("experiment_design.optimise.duration.search_campaign", out_of_reach)
+    found = least_duration(make_request(duration=60.0), {"Yvv": 0.02})
+    assert found.duration == 60.0
+    assert found.targets == (0.02,)
+
+
+@pytest.mark.long
+def test_the_limit_that_stops_a_target():
+    limits = TrialLimits(margins={"u": 0.5, "v": 0.4}, headings=30.0)
+    request = make_request(duration=100.0, effort=0.02, limits=limits)
+    longest = least_duration(request, {"Yvv": 0.02}, workers=1)
+    with pytest.raises(InfeasibleError, match="headings cannot cover 30 rad"):
+        design_trial(longest, workers=1, alternatives=False)
+    closest = design_trial(longest, workers=1, alternatives=False, best_effort=True)
+    assert closest.status.startswith("limits not kept")
+    assert any("headings cannot cover 30 rad" in n for n in closest.notes)
 
 
 @pytest.mark.parametrize(
