@@ -61,7 +61,7 @@ class StreamedFile:
     numbers : tuple of int
         Of segments, as they follow from gaps and cuts, before each window.
     sample_time : float
-        [s]
+        On average over the file, that of every window [s].
     whole : bool
         Whether rows can only be found by reading those before them, as in a text.
     skipped : frozenset of int
@@ -342,6 +342,7 @@ def _cuts(
     """
     gaps: list[int] = []
     rows, last, step = 0, np.nan, 0.0
+    seconds, count = 0.0, 0
     for batch in table.batches([time.raw]):
         raw = np.asarray(batch[time.raw], float)
         if not step:
@@ -350,6 +351,8 @@ def _cuts(
             step = float(np.median(np.diff(raw))) if len(raw) > 1 else 0.0
         steps = np.diff(raw, prepend=last)
         gaps += (np.flatnonzero(steps > GAP * step) + rows).tolist()
+        usual = steps[np.abs(steps - step) < 0.5 * step]
+        seconds, count = seconds + float(usual.sum()), count + len(usual)
         rows, last = rows + len(raw), raw[-1] if len(raw) else last
     if not step > 0:
         raise LogError(
@@ -367,7 +370,7 @@ def _cuts(
         cuts.append(cut)
         before += int(((marks > start) & (marks < cuts[-1])).sum()) + 1
         numbers.append(before)
-    return (*cuts, rows), tuple(numbers), round(step * scale, 9)
+    return (*cuts, rows), tuple(numbers), round((seconds / count if count else step) * scale, 9)
 
 
 @dataclass(frozen=True)
@@ -429,7 +432,9 @@ def _segments(
     if window in file.skipped:
         return []
     try:
-        segments = table_segments(rows, file.vessel, file.known, states=stream.states)
+        segments = table_segments(
+            rows, file.vessel, file.known, states=stream.states, sample_time=file.sample_time
+        )
         if stream.sample_time is not None:
             segments, _ = decimate_segments(segments, stream.sample_time)
     except LogError as error:

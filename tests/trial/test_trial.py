@@ -13,6 +13,8 @@ from greybox.trial.convert.read import read_log
 from greybox.trial.import_files import import_files
 from greybox.trial.kinematics import decimate, decimate_segments, velocities_from_positions
 from greybox.trial.log import make_log
+from greybox.trial.log_files import find_logs
+from greybox.trial.stream import open_stream
 from greybox.trial.wind import relative_wind
 from greybox.vessel.toml import load_vessel, vessel_from_dict
 
@@ -288,6 +290,27 @@ def test_a_longer_sample_time_keeps_how_velocities_were_made(tmp_path, velocitie
 def test_bad_logs(tmp_path, change, message):
     with pytest.raises(LogError, match=message):
         read(change(table()), tmp_path)
+
+
+def test_windows_of_a_stream_have_the_sample_time_of_their_file(tmp_path, monkeypatch):
+    """Jitter gives each window another mean, and one estimate needs one sample time."""
+    monkeypatch.setattr("greybox.trial.stream._LEAST_ROWS", 500)
+    monkeypatch.setattr("greybox.trial.stream._MOST_ROWS", 500)
+    t = 0.5 * np.arange(2000) + np.random.default_rng(0).uniform(-0.03, 0.03, 2000)
+    table(2000, t=t).to_parquet(tmp_path / "log.parquet")
+    ship = vessel_from_dict(SHIP)
+    stream, found = open_stream(find_logs([str(tmp_path)]), ship).run(len)
+    logs = stream.read([place for place, _ in found])
+    assert [len(log) for log in logs] == [500] * 4
+    whole = read_log(tmp_path / "log.parquet", ship).sample_time
+    assert {log.sample_time for log in logs} == {stream.interval}
+    assert stream.interval == pytest.approx(whole, rel=1e-9)
+    # a part at a rate of its own keeps it, for what needs one sample time to refuse
+    t[1500:] = t[1499] + 0.6 * np.arange(1, 501)
+    table(2000, t=t).to_parquet(tmp_path / "log.parquet")
+    stream, found = open_stream(find_logs([str(tmp_path)]), ship).run(len)
+    slow = stream.read([place for place, _ in found])[-1]
+    assert slow.sample_time == pytest.approx(0.6)
 
 
 def test_a_column_that_another_thruster_has_is_no_misspelling(tmp_path):

@@ -149,6 +149,7 @@ def table_segments(
     *,
     states: tuple[str, ...] = (),
     fill: Mapping[str, float] | None = None,
+    sample_time: float | None = None,
 ) -> list[TrialLog]:
     """Return the segments between the gaps of a table, as `read_segments` does of a file's.
 
@@ -156,9 +157,14 @@ def table_segments(
     ----------
     known : Provenance
         Of the table; what is done here is added to it.
+    sample_time : float, optional
+        Of the file of which the table is a part [s], taken where the part agrees with it; the
+        part's own mean by default.
     """
     name = table.path.name
-    recording, sample_time, lost = _clean_recording(table, vessel, known, plan=bool(fill))
+    recording, sample_time, lost = _clean_recording(
+        table, vessel, known, sample_time, plan=bool(fill)
+    )
     plan = _recorded_grid(recording, table, sample_time)
     conversion = Conversion(vessel, ImportOptions(), plan, recording.steps)
     cut = cut_segments(recording, conversion)
@@ -186,7 +192,12 @@ def table_segments(
 
 
 def _clean_recording(
-    table: TableFile, vessel: Vessel, known: Provenance, *, plan: bool
+    table: TableFile,
+    vessel: Vessel,
+    known: Provenance,
+    sample_time: float | None,
+    *,
+    plan: bool,
 ) -> tuple[Recording, float, list[str]]:
     """Return the table as a recording that needs no mending, sample time [s], what was left out.
 
@@ -204,7 +215,8 @@ def _clean_recording(
     if time.raw not in table.dates:
         # a log's own clock is kept as it is
         scale = replace(scale, zero=0.0, epoch=None)
-    sample_time = _require_uniform(scale.seconds(batch[time.raw]), rows, table, notes)
+    t = scale.seconds(batch[time.raw])
+    sample_time = _require_uniform(t, rows, table, notes, sample_time)
     raw = whole_recording(table, batch, assigned, scale, vessel)
     recording = replace(canonical(raw, assigned, vessel), steps=(*known.steps, *raw.steps))
     for rudder in (s for s in recording.signals if s.name in vessel.rudders):
@@ -307,11 +319,16 @@ def _importer(table: TableFile) -> str:
 
 
 def _require_uniform(
-    t: Array, rows: NDArray[np.intp], table: TableFile, left_out: Sequence[str]
+    t: Array,
+    rows: NDArray[np.intp],
+    table: TableFile,
+    left_out: Sequence[str],
+    whole: float | None = None,
 ) -> float:
     """Return the sample time [s]; refuse a table whose samples would have to be resampled.
 
-    Times are those of some `rows` of the table, and `left_out` says why there are no more.
+    Times are those of some `rows` of the table, and `left_out` says why there are no more. That
+    of the `whole` file is taken where the table is a part of one and agrees with it.
     """
     name, importer = table.path.name, _importer(table)
     if len(t) < MIN_SEGMENT:
@@ -362,7 +379,11 @@ def _require_uniform(
                 f"{two:.6g} s in its second. Resample it to one with {importer}."
             )
         means.append((b - a, mean))
-    return round(max(means)[1], 9)
+    count, mean = max(means)
+    if whole is not None and abs(mean - whole) * (count - 1) <= 2 * _DRIFT * whole:
+        # means of two parts differ by the jitter of their ends
+        return whole
+    return round(mean, 9)
 
 
 def _require(
