@@ -160,6 +160,24 @@ def test_midnight(tmp_path):
     assert recording.epoch == 1717113600 + 86390
 
 
+def test_a_pause_after_midnight_is_no_late_sentence(tmp_path):
+    fixes = [86390, 86391, 87000, 86400 + 46800, 86400 + 46801]
+    lines = [gga(k) + rmc(k, "310524" if k < 86400 else "010624") for k in fixes]
+    recording = read(tmp_path, *lines)
+    np.testing.assert_allclose(recording["lat"].t, np.subtract(fixes, fixes[0]))
+    assert recording.epoch == 1717113600 + fixes[0]
+    # a sentence that comes two seconds late belongs to the day before
+    late = [rmc(k, "310524" if k < 86400 else "010624") for k in (86398, 86400, 86399, 86401)]
+    np.testing.assert_allclose(np.sort(read(tmp_path, *late)["lat"].t), [0, 1, 2, 3])
+
+
+def test_a_sure_date_tells_a_pause_of_nearly_a_day(tmp_path):
+    fixes = [86390, 86400, 86401, 2 * 86400 - 5]
+    lines = [rmc(k, "310524" if k < 86400 else "010624") for k in fixes]
+    t = read(tmp_path, *lines)["lat"].t
+    np.testing.assert_allclose(t, np.subtract(fixes, fixes[0]))
+
+
 def test_two_days_in_one_file(tmp_path):
     lines = [rmc(36000 + k, "010624") for k in range(9)] + [
         rmc(30000 + k, "030624") for k in range(9)

@@ -36,6 +36,8 @@ _STAMP = re.compile(
 )
 # a date that jumps further is a receiver that has just woken up
 _MAX_DAYS = 366
+# a sentence comes at most so long after its time [s]
+_LATE = 600.0
 # by unit: factor to SI, and the SI unit
 _FACTORS = {symbol: (unit.factor, unit.si) for symbol, unit in UNITS.items()}
 # sides of the ship, and of the meridian
@@ -103,7 +105,7 @@ class _Stream:
             if now < before - _DAY / 2:
                 self.day += 1
                 now += _DAY
-            elif now > before + _DAY / 2 and self.day > 0:
+            elif before - _LATE < now - _DAY < before and self.day > 0:
                 # a late sentence of the day before
                 now -= _DAY
             if now == before:
@@ -125,10 +127,12 @@ class _Stream:
         zero, first = self.first_date
         days = zero + (found - first).days - self.day
         # several days may lie between two recordings in one file
-        if sure and 0 < days <= _MAX_DAYS:
+        if sure and 0 <= days <= _MAX_DAYS:
             self.day += days
             if self.tags and self.tag_order[-1] == self.order:
-                self.tags[-1] += days * _DAY
+                # a pause of nearly a day looks like a late sentence
+                late = self.tags[-1] < (self.day - days) * _DAY
+                self.tags[-1] += (days + late) * _DAY
 
 
 @dataclass(frozen=True)
