@@ -274,6 +274,17 @@ def test_absolute_times_set_the_epoch(tmp_path, time, word):
     assert any(word in n for n in recording.notes)
 
 
+def test_a_stated_second_is_no_day(tmp_path):
+    for tree in (
+        {"time_s": column(750000 + T)},
+        {"log": {"time": 750000 + T, "TimeInfo": {"Units": "seconds"}}},
+    ):
+        where = tree.get("log", tree)
+        where["u"] = column(U)
+        (signal,) = read_mat(five(tmp_path / "a.mat", tree)).signals
+        np.testing.assert_allclose(np.diff(signal.t), np.diff(T), atol=1e-9)
+
+
 @pytest.mark.parametrize("style", ["{:%Y-%m-%d %H:%M:%S}", "{:%d-%b-%Y %H:%M:%S}"])
 def test_dates_as_text_are_a_time(tmp_path, style):
     from datetime import UTC, datetime

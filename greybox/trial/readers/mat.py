@@ -438,7 +438,7 @@ def _time(name: str, value: Any, stated: str | None) -> _Time | None:
     if not steps.max() > 0 or np.mean(steps >= 0) < _RISING:
         return None
     middle = float(np.median(known))
-    if _DATENUM[0] <= middle <= _DATENUM[1]:
+    if stated in (None, "d") and _DATENUM[0] <= middle <= _DATENUM[1]:
         start = float(known[0])
         note = f"'{name}' was taken as MATLAB datenum (days), for it is near {middle:.0f}."
         t = np.asarray((raw - start) * 86400.0, float)
