@@ -107,8 +107,10 @@ class SensitivityProgram:
                 f"{', '.join(structure.disturbances) or 'none'}."
             )
         turns = "r" in states
-        # the heading moves the states only where something drifts past the ship
-        heading = turns and (noise.heading > 0 or bool(d.any()))
+        # the heading moves the states only where something drifts past the ship; a measured wind
+        # is an input
+        drift = d[:2] if predictor.air_measured else d
+        heading = turns and (noise.heading > 0 or bool(drift.any()))
         self.size = self.nx + heading
         std = np.append(noise.measurement, [noise.heading] * heading)
         self.weight = np.where(std > 0, 1 / np.where(std > 0, std, 1.0) ** 2, 0.0)

@@ -134,6 +134,19 @@ def test_ascent_climbs_it(ship, thesis, true_theta):
     assert found.value > problem.evaluate(unit[None]).value[0] + 3
 
 
+def test_a_measured_wind_needs_no_heading(ship, thesis, true_theta):
+    """It is an input: without a current the heading at the start moves no state."""
+    predictor = build_predictor(thesis, "wind", REGIME)
+    schedule = make_schedule(ship, 60, 10, 1.0)
+    for current, named in (((0.0, 0.0), False), ((0.3, -0.2), True)):
+        d = np.array([*current, 5.0, 2.0])
+        program = SensitivityProgram(predictor, true_theta, d, noise_of(thesis, 0.0), 1.0)
+        motion = rollout_of(ship, thesis, true_theta, d).run(random_commands(ship, schedule))
+        gram = program(motion.state[:, :-1, :3], motion.state[:, :-1, 3], motion.tau).gram[0]
+        assert (np.diag(gram) > 0).all()
+        assert ("psi(0)" in program.names) == named
+
+
 def test_misuse(ship, thesis, true_theta):
     predictor = build_predictor(thesis, "basic", REGIME)
     exact = NoiseLevels(thesis.states, np.array([0.1, 0.0, 0.1]), np.full(3, 0.1))
