@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from experiment_design.constraints.limits import TrialLimits
 from experiment_design.feasibility.checks import ROOM, tells_enough
 from experiment_design.feasibility.stability import unstable_sentence
+from experiment_design.information.estimators import ESTIMATORS
 from experiment_design.optimise.campaign import random_campaign
 from experiment_design.request.apparent_wind import clear_heading
 from experiment_design.request.exclusions import (
     COVARIANCE,
     MEASURED_WIND,
+    REGRESSORS,
     SURGE_SIGN,
     SWAY_SIGN,
     YAW_RATE,
@@ -120,6 +122,7 @@ def prepare_request(
     predictor = _predictor(model, structure, asked, notes)
     d, dt = expected_disturbances(model, asked), model.sample_time
     measuring = PREDICTORS[predictor].air_measured
+    free_run = ESTIMATORS[asked.estimator].free_run
     automatic = asked.regime.strip().lower() == "auto"
     parts = candidate_regimes(structure.states)[:1]
     if not automatic:
@@ -129,6 +132,7 @@ def prepare_request(
     lacking = {
         YAW_RATE: "" if "r" in structure.states else f"structure '{structure.name}' has none",
         MEASURED_WIND: "" if measuring else f"predictor '{predictor}' does not measure it",
+        REGRESSORS: f"estimator '{asked.estimator}' fits free runs" if free_run else "",
         COVARIANCE: "" if model.covariance.any() else "it has none",
         SURGE_SIGN: "" if "u" in signed else unsigned,
         SWAY_SIGN: "" if "v" in signed else unsigned,
@@ -142,7 +146,7 @@ def prepare_request(
     gust = asked.gust
     if gust is None:
         gust = _GUSTINESS * float(np.hypot(*d[2:]))
-        if measuring:
+        if measuring and not free_run:
             notes.append(
                 f"the wind is taken to vary by {gust:.2g} m/s about its mean, without which its "
                 f"terms could not be told from the water's (--gust to change)"

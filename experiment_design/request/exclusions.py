@@ -22,7 +22,8 @@ COEFFICIENTS = (
 # conditions that options act under
 YAW_RATE, COVARIANCE, MEASURED_WIND = "a yaw rate", "a covariance", "a measured wind"
 SURGE_SIGN, SWAY_SIGN = "a sign of surge", "a sign of sway"
-CONDITIONS = (YAW_RATE, COVARIANCE, MEASURED_WIND, SURGE_SIGN, SWAY_SIGN)
+REGRESSORS = "an estimator of regressors"
+CONDITIONS = (YAW_RATE, COVARIANCE, MEASURED_WIND, SURGE_SIGN, SWAY_SIGN, REGRESSORS)
 _SPELT = {"purpose": "--for"}
 
 
@@ -183,6 +184,10 @@ RULES = (
     _without(
         "gust", MEASURED_WIND, "{option} is how a measured wind varies about its mean",
         "leave it out, or use --predictor wind",
+    ),
+    _without(
+        "gust", REGRESSORS, "{option} is how a measured wind varies in the regressors",
+        "leave it out, or use --estimator iv",
     ),
     _without("yaw_cap", YAW_RATE, "{option} bounds the yaw rate", "leave it out"),
     _without(

@@ -197,6 +197,7 @@ UNMET = {
     "a yaw rate": ("--model", "surge.json"),
     "a covariance": ("--model", "exact.json", "--regime", "u+v+"),
     "a measured wind": ("--model", "model.json", "--wind", "5,3"),
+    "an estimator of regressors": ("--model", "model.json", *WIND, "--estimator", "oe"),
     "a sign of surge": ("--model", "model.json", "--regime", "v+"),
     "a sign of sway": ("--model", "model.json", "--regime", "u+"),
 }
@@ -290,10 +291,11 @@ BRIEF = ("--duration", "60", "--effort", "0.001", "--workers", "1", "--seed", "3
 def hasty(monkeypatch):
     """Searches of a few evaluations: what they aim at is tested, not how near they come."""
     from experiment_design import design
+    from experiment_design.feasibility import constraint_satisfaction
     from experiment_design.optimise import campaign
 
     monkeypatch.setattr(campaign, "_LEAST", 20)
-    monkeypatch.setattr(design, "_TIGHTENINGS", 1)
+    monkeypatch.setattr(constraint_satisfaction, "_TIGHTENINGS", 1)
     monkeypatch.setattr(design, "_POLISH", 2)
 
 

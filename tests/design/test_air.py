@@ -46,6 +46,15 @@ def free():
     return design_trial(wind_request(), workers=1, alternatives=False)
 
 
+def test_gusts_are_of_regressors_alone():
+    asked = {"regime": "u+v+", "start": (1.5, 1.2, 0.0, 0.0)}
+    assert any("--gust to change" in n for n in wind_request(**asked).notes)
+    asked["estimator"] = "oe"
+    assert not any("--gust" in n for n in wind_request(**asked).notes)
+    with pytest.raises(UsageError, match="--gust .*, and estimator 'oe' fits free runs: leave it"):
+        wind_request(gust=2.0, **asked)
+
+
 def test_where_no_random_sequence_keeps_a_margin_a_steady_course_is_moved():
     problem = build_problem(wind_request(0.6))
     assert random_campaign([problem], 0) == (None, 0)
