@@ -51,7 +51,7 @@ def test_gusts_are_of_regressors_alone():
     assert any("--gust to change" in n for n in wind_request(**asked).notes)
     asked["estimator"] = "oe"
     assert not any("--gust" in n for n in wind_request(**asked).notes)
-    with pytest.raises(UsageError, match="--gust .*, and estimator 'oe' fits free runs: leave it"):
+    with pytest.raises(UsageError, match="and estimator 'oe' fits free runs: leave it"):
         wind_request(gust=2.0, **asked)
 
 
