@@ -47,19 +47,24 @@ def noise_levels(
     states = model.structure.states
     residual = np.asarray(model.residual_std, float)
     has_residual = residual.shape == (len(states),) and bool((residual > 0).all())
-    stated = [vessel.std(s) for s in states]
+    channels = (*states, "psi", "wind")
+    stated = {n: vessel.std(n) for n in channels}
     a = np.asarray(
         StepModel(model.structure, model.integrator).jacobians(
             [1.0] * len(states), 0.0, [0.0] * len(model.structure.inputs),
             model.d, [1.0, 1.0], model.theta, model.sample_time,
         )[0]
     )  # fmt: skip
-    missing = [s for s, v in zip(states, stated, strict=True) if v is None]
-    if missing and model.noise is not None:
-        stated = [
-            m if v is None else v for m, v in zip(model.noise.measurement, stated, strict=True)
-        ]
-        missing = []
+    told = ["sensors of the vessel file"] if any(v is not None for v in stated.values()) else []
+    if model.noise is not None:
+        levels = (*model.noise.measurement, model.noise.heading, model.noise.wind)
+        found = {n: x for n, x in zip(channels, levels, strict=True) if stated[n] is None}
+        stated |= found
+        # a heading or a wind of no noise was not measured
+        names = ["heading" if n == "psi" else n for n, x in found.items() if n in states or x]
+        if names:
+            told.append(f"noise of {', '.join(names)} as the model's estimate found it")
+    missing = [s for s in states if stated[s] is None]
     if missing and not has_residual:
         raise UsageError(
             f"nothing tells how noisy {', '.join(missing)} "
@@ -68,9 +73,11 @@ def noise_levels(
         )
     # without a stated sensor, half of the residual is taken as the sensor's
     measurement = np.array(
-        [residual[i] / np.sqrt(2.0) if v is None else v for i, v in enumerate(stated)]
-    )
-    told = ["sensors of the vessel file" if not missing else "residuals of the model"]
+        [residual[i] / np.sqrt(2.0) if stated[s] is None else stated[s]
+         for i, s in enumerate(states)]
+    )  # fmt: skip
+    if missing:
+        told.append(f"noise of {', '.join(missing)} from the model's residuals")
     if process is None and model.noise is not None:
         process = np.asarray(model.noise.process, float)
         told.append("process noise as the model's estimate found it")
@@ -93,7 +100,7 @@ def noise_levels(
         states,
         measurement,
         process,
-        vessel.std("psi") or 0.0,
-        vessel.std("wind") or 0.0,
+        stated["psi"] or 0.0,
+        stated["wind"] or 0.0,
         "; ".join(told),
     )

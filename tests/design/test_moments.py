@@ -7,7 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from designs import make_request
+from designs import make_request, thesis_model
 
 from experiment_design.criteria.covariance import Criterion
 from experiment_design.information.moments import Moments
@@ -228,8 +228,6 @@ def test_predicted_errors_are_those_of_monte_carlo(predictor):
 
 def test_noise_levels_from_residuals_and_sensors():
     request = make_request()
-    from designs import thesis_model
-
     model = thesis_model()
     levels = noise_levels(model, model.vessel)
     np.testing.assert_allclose(levels.measurement, 0.014142)
@@ -240,6 +238,7 @@ def test_noise_levels_from_residuals_and_sensors():
     residual = np.sqrt(beyond + 0.003**2)
     levels = noise_levels(replace(model, residual_std=residual), model.vessel)
     np.testing.assert_allclose(levels.process, 0.003, rtol=1e-6)
+    assert levels.source == "sensors of the vessel file; process noise from the model's residuals"
     with pytest.raises(UsageError, match="one that is not negative is needed for each of u, v, r"):
         noise_levels(model, model.vessel, np.array([1.0]))
     blind = replace(model, vessel=load_vessel("ferry"))
@@ -248,6 +247,23 @@ def test_noise_levels_from_residuals_and_sensors():
                      replace(blind.vessel, sensors={}))  # fmt: skip
     with pytest.raises(UsageError, match="the noise of u is 0"):
         NoiseLevels(("u",), np.zeros(1), np.zeros(1))
+
+
+def test_noise_levels_that_the_model_found_take_the_place_of_sensors():
+    model = thesis_model()
+    found = NoiseLevels(
+        model.structure.states, np.array([0.05, 0.06, 0.004]), np.full(3, 0.01), 0.02, 0.3
+    )
+    bare = replace(model.vessel, sensors={})
+    levels = noise_levels(replace(model, noise=found), bare)
+    np.testing.assert_array_equal(levels.measurement, found.measurement)
+    assert (levels.heading, levels.wind) == (0.02, 0.3)
+    assert levels.source.startswith("noise of u, v, r, heading, wind as the model's estimate")
+    partly = replace(model.vessel, sensors={"u_std": 0.1, "heading_std": 0.01})
+    levels = noise_levels(replace(model, noise=replace(found, wind=0.0)), partly)
+    np.testing.assert_array_equal(levels.measurement, [0.1, 0.06, 0.004])
+    assert levels.heading == 0.01
+    assert "sensors of the vessel file; noise of v, r as the model's" in levels.source
 
 
 def test_an_unknown_criterion():
