@@ -11,7 +11,7 @@ import pytest
 from greybox.errors import LogError, VesselError
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.convert.read import read_log, read_segments
-from greybox.trial.convert.sensor_corrections import correct_log
+from greybox.trial.convert.sensor_corrections import correct_channels, correct_log
 from greybox.trial.dataframe import recording_from_pandas
 from greybox.trial.import_files import import_files
 from greybox.trial.log import make_log
@@ -259,6 +259,17 @@ def test_only_the_signs_that_import_mended_are_left_to_it(tmp_path):
     np.testing.assert_array_equal(got["r"], log["r"])
     np.testing.assert_array_equal(got["a"], -log["a"])
     assert any("reversed of r is not applied" in n for n in got.provenance.read)
+
+
+def test_a_mended_clock_leaves_those_of_other_sensors_to_the_vessel_file():
+    channels = {n: np.arange(50.0) for n in ("u", "v", "r", "psi", "u_q", "v_q")}
+    vessel = ship(clock={"u": -1.0, "psi": 1.0, "u_q": 2.0})
+    mended = (mend("shift", ("psi",), late=1.0),)
+    got = correct_channels(channels, 1.0, vessel, mended)
+    # what ties the motions was mended on one side or the other, the wind was not
+    assert got.channels["psi"][10] == got.channels["u"][10] == 10
+    assert got.channels["u_q"][10] == 12
+    assert any("clock of psi, u is not applied: it was mended" in n for n in got.notes)
 
 
 def test_what_import_mended_is_left_to_it(tmp_path):

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Arm = tuple[float, float]
 
 # keys that a finding made void which mended the same
-_MENDED_BY = {"heading_bias": "turn_heading", "antenna": "move_antenna", "clock": "shift"}
+_MENDED_BY = {"heading_bias": "turn_heading", "antenna": "move_antenna"}
 # sums of corrections that a record tells differ from what is stated by rounding only
 _ROUNDING = 1e-9
 
@@ -209,6 +209,14 @@ def _wanted(
     if mended:
         stated["reversed"] = tuple(c for c in stated["reversed"] if c not in mended)
         void.append(f"reversed of {', '.join(sorted(mended))}")
+    shifted = {n for s in mends if s.operation == "shift" for n in s.channels}
+    if shifted & MOTIONS:
+        # the checks move either side of a lateness, and leave all motions on one clock
+        shifted |= MOTIONS
+    mended = shifted & set(stated.get("clock", ()))
+    if mended:
+        stated["clock"] = {c: late for c, late in stated["clock"].items() if c not in mended}
+        void.append(f"clock of {', '.join(sorted(mended))}")
     notes = (f"[sensors] {k} is not applied: it was mended when the log was made" for k in void)
     return replace(before, **stated), tuple(notes)
 
