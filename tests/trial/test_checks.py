@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from virtual import as_recording, recorded
@@ -11,6 +13,7 @@ from greybox.trial.checks.check import check_files, check_recording
 from greybox.trial.checks.course import course_findings
 from greybox.trial.checks.finding import IDS
 from greybox.trial.checks.thruster_response import response_findings
+from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs, repair
@@ -203,6 +206,51 @@ def test_without_a_velocity_sensor_a_bias_cannot_be_told(ship):
     said = {o.id: o for o in report.outcomes}
     assert said["heading_bias"].status == "cannot tell"
     assert "no velocity sensor of its own" in said["heading_bias"].sentence
+
+
+@pytest.mark.parametrize(("turned", "side"), [(0.6, "34 deg to port"), (-0.6, "34 deg to star")])
+def test_the_side_on_which_the_course_lies_needs_no_sign(turned, side):
+    t = np.arange(600.0)
+    course = 0.02 * t
+    columns = {"x_n": 100 * np.sin(course), "y_n": -100 * np.cos(course), "psi": course + turned}
+    level = dict.fromkeys(("n", "alpha1", "alpha2"), 0 * t)
+    ((found,), _) = course_findings(
+        as_recording({"t": t, **columns, **level}), load_vessel("thesis")
+    )
+    assert f"the course lies {side}" in found.evidence
+
+
+def turning_in_wind():
+    """A steady turn in a steady wind, its speed through the air as measured."""
+    rng = np.random.default_rng(0)
+    t = np.arange(0, 900, 0.5)
+    psi = 0.01 * t
+    c, s = np.cos(psi), np.sin(psi)
+    d = {"t": t, "psi": psi, "u": 3 + 0.05 * rng.standard_normal(len(t)), "v": 0 * t + 0.1}
+    return d | {"u_q": 3 - (c * 5 + s * 2), "v_q": 0.1 - (c * 2 - s * 5)}
+
+
+WIND = {
+    "v_q reversed": (lambda d: negate(d, "v_q"), "sign", ("v_q",), -1.0),
+    "u_q reversed": (lambda d: negate(d, "u_q"), "sign", ("u_q",), -1.0),
+    "both reversed": (lambda d: negate(d, "u_q", "v_q"), "sign", ("u_q", "v_q"), -1.0),
+    "swapped": (lambda d: swap(d, "u_q", "v_q"), "sign", ("u_q", "v_q"), 0.0),
+}
+
+
+@pytest.mark.parametrize("name", WIND)
+@pytest.mark.parametrize("positioned", [True, False])
+def test_another_convention_of_the_wind_is_mended_where_positions_tie_the_motion(name, positioned):
+    plant, kind, channels, value = WIND[name]
+    d = plant(turning_in_wind())
+    # of positions only that they are there: what they tell comes before
+    d |= {"x_n": 0 * d["t"], "y_n": 0 * d["t"]} if positioned else {}
+    (found,) = wind_findings(as_recording(d), [])
+    assert (found.id, found.channels, found.value) == (kind, channels, value)
+    assert found.safe is positioned
+    assert ("(import --fix does)" in found.fix) is positioned
+    doubtful = replace(found, channels=("psi",), safe=False)
+    assert not wind_findings(as_recording(d), [doubtful])
 
 
 def test_thrusters_that_push_sideways_are_not_taken_for_a_turned_compass():

@@ -84,7 +84,7 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
         bias,
         (bias - half, bias + half),
         "rad",
-        f"under way the course lies {np.degrees(angle):.0f} deg "
+        f"under way the course lies {abs(np.degrees(angle)):.0f} deg "
         f"{'to starboard' if angle > 0 else 'to port'} of the heading on all headings (over "
         f"{np.degrees(spread):.0f} deg): a vessel does not go so sideways, its compass or antenna "
         f"pair is turned",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,31 +20,45 @@ _RATIO = 3.0
 _LEAST_TURN = np.radians(60)
 _BLOCK_SECONDS = 20.0
 
-Convention = tuple[str, str, str, tuple[Step, ...], Callable[[Array, Array, Array], Array]]
 
-_NEGATED = (mend("scale", ("u_q", "v_q"), factor=-1.0),)
-_CONVENTIONS: tuple[Convention, ...] = (
-    (
-        "sign", "u_q and v_q are the wind, not the velocity of the ship through the air",
-        "change the sign of both (import --fix does)", _NEGATED, lambda u, v, psi: -(u + 1j * v),
+@dataclass(frozen=True)
+class _Convention:
+    """One reading of the wind's channels: what is wrong with them, what to do, what is meant."""
+
+    id: str
+    channels: tuple[str, ...]
+    words: str
+    fix: str
+    repair: tuple[Step, ...]
+    meant: Callable[[Array, Array, Array], Array]
+
+
+def _reversed(
+    channels: tuple[str, ...], words: str, meant: Callable[[Array, Array, Array], Array]
+) -> _Convention:
+    repair = (mend("scale", channels, factor=-1.0),)
+    return _Convention(
+        "sign", channels, words, f"change the sign of {' and '.join(channels)}", repair, meant
+    )
+
+
+_CONVENTIONS = (
+    _reversed(
+        ("u_q", "v_q"), "u_q and v_q are the wind, not the velocity of the ship through the air",
+        lambda u, v, psi: -(u + 1j * v),
     ),
-    (
-        "sign", "v_q is reversed (the wind's direction counts anticlockwise)",
-        "change the sign of v_q (import --fix does)", (mend("scale", ("v_q",), factor=-1.0),),
+    _reversed(
+        ("v_q",), "v_q is reversed (the wind's direction counts anticlockwise)",
         lambda u, v, psi: u - 1j * v,
     ),
-    (
-        "sign", "u_q is reversed",
-        "change the sign of u_q (import --fix does)", (mend("scale", ("u_q",), factor=-1.0),),
-        lambda u, v, psi: -u + 1j * v,
+    _reversed(("u_q",), "u_q is reversed", lambda u, v, psi: -u + 1j * v),
+    _Convention(
+        "sign", ("u_q", "v_q"), "u_q and v_q are swapped", "exchange u_q and v_q",
+        (mend("exchange", ("u_q", "v_q")),), lambda u, v, psi: v + 1j * u,
     ),
-    (
-        "sign", "u_q and v_q are swapped",
-        "exchange u_q and v_q (import --fix does)", (mend("exchange", ("u_q", "v_q")),),
-        lambda u, v, psi: v + 1j * u,
-    ),
-    (
-        "frame", "u_q and v_q are north and east components, not along the body's axes",
+    _Convention(
+        "frame", ("u_q", "v_q"),
+        "u_q and v_q are north and east components, not along the body's axes",
         "turn them by the heading into body axes", (),
         lambda u, v, psi: (u + 1j * v) * np.exp(-1j * psi),
     ),
@@ -63,7 +78,14 @@ def wind_findings(recording: Recording, findings: list[Finding]) -> list[Finding
         Canonical, mended.
     findings : list of Finding
         Those made before: where the motion itself is in doubt, nothing is said.
+
+    Returns
+    -------
+    list of Finding
+        At most one; safe to mend where positions tell that velocities and heading are right.
     """
+    if any(f.id in ("frame", "sign", "unit") and not f.safe for f in findings):
+        return []
     motion = make_motion(recording, ("psi", "u", "v", "u_q", "v_q"))
     if motion is None or not all(n in motion for n in ("psi", "u", "v", "u_q", "v_q")):
         return []
@@ -78,27 +100,30 @@ def wind_findings(recording: Recording, findings: list[Finding]) -> list[Finding
         return float(np.sum(np.var(air, axis=0)))
 
     as_named = scatter(u_q + 1j * v_q)
-    others = [(scatter(c[4](u_q, v_q, psi)), k) for k, c in enumerate(_CONVENTIONS)]
-    best, k = min(others)
+    best, k = min((scatter(c.meant(u_q, v_q, psi)), k) for k, c in enumerate(_CONVENTIONS))
     blocks = max(int(np.ptp(motion.t) / _BLOCK_SECONDS), 1)
     if best * _RATIO > as_named or blocks < 5:
         return []
-    kind, words, fix, steps, meant = _CONVENTIONS[k]
-    through = meant(u_q, v_q, psi)
+    convention = _CONVENTIONS[k]
+    through = convention.meant(u_q, v_q, psi)
     ratio = float(np.sqrt(as_named / max(best, 1e-12)))
+    tied = "x_n" in recording and "y_n" in recording
+    doubt = "" if tied else "; without positions u, v or psi may be at fault instead"
+    option = "--fix" if tied else f"--fix-also {convention.id}"
+    value = -1.0 if any(s.operation == "scale" for s in convention.repair) else 0.0
     return [
         Finding(
-            kind,
-            "u_q" if k != 1 else "v_q",
-            -1.0,
-            (-1.0, -1.0),
+            convention.id,
+            convention.channels[0],
+            value,
+            (value, value),
             "1",
-            f"{words}: read so, the true wind is {ratio:.1f} times steadier while the ship turns "
-            f"over {np.degrees(np.ptp(psi)):.0f} deg",
-            fix,
-            ("u_q", "v_q") if k != 1 else ("v_q",),
-            steps,
-            bool(steps),
+            f"{convention.words}: read so, the true wind is {ratio:.1f} times steadier while the "
+            f"ship turns over {np.degrees(np.ptp(psi)):.0f} deg{doubt}",
+            f"{convention.fix} (import {option} does)" if convention.repair else convention.fix,
+            convention.channels,
+            convention.repair,
+            tied and bool(convention.repair),
             {
                 "t": motion.t,
                 "psi": psi,
