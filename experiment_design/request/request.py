@@ -450,17 +450,9 @@ def build_criterion(request: PreparedRequest, predictor: Predictor) -> Criterion
     require_compatible(request.given)
     chosen = wanted_columns(predictor, request.wanted or tuple(request.combination))
     names = [predictor.columns[i].name for i in chosen]
-    structure = request.structure
-    scale = np.array(
-        [
-            abs(sum(float(request.theta[structure.index(t)]) for t in predictor.columns[i].terms))
-            for i in chosen
-        ]
-    )
-    # a parameter that is zero a priori is measured by what the others of its equation are
-    scale = np.where(scale > 0, scale, scale[scale > 0].min(initial=1.0))
-    if request.targets:
-        scale = np.array(request.targets, float)
+    scale = np.array(request.targets, float)
+    if not request.targets:
+        scale = _prior_magnitudes(request, predictor)[list(chosen)]
     combination = np.zeros(len(names))
     for name, slope in request.combination.items():
         combination[chosen.index(wanted_columns(predictor, (name,))[0])] += slope
@@ -472,6 +464,18 @@ def build_criterion(request: PreparedRequest, predictor: Predictor) -> Criterion
         # sensitivities stand in the order of the parameters, bias-capturing columns left out
         wanted = tuple(predictor.parameter_columns.index(i) for i in chosen)
     return Criterion(request.criterion, wanted, scale, combination, prior)
+
+
+def _prior_magnitudes(request: PreparedRequest, predictor: Predictor) -> Array:
+    """Return the magnitude of each column's prior value, (columns,)."""
+    theta, index = request.theta, request.structure.index
+    own = np.array([abs(sum(float(theta[index(t)]) for t in c.terms)) for c in predictor.columns])
+    out = own.copy()
+    # a parameter that is zero a priori is measured by what the others of its equation are
+    for i in np.flatnonzero(own == 0):
+        others = own[predictor.equation(predictor.columns[i].state)]
+        out[i] = others[others > 0].min(initial=1.0)
+    return out
 
 
 def wanted_parameters(request: PreparedRequest, criterion: Criterion) -> tuple[Column, ...]:

@@ -266,6 +266,24 @@ def test_noise_levels_that_the_model_found_take_the_place_of_sensors():
     assert "sensors of the vessel file; noise of v, r as the model's" in levels.source
 
 
+def test_a_parameter_of_zero_is_measured_by_its_own_equation():
+    request = make_request(predictor="wind", d=np.array([0.0, 0.0, 5.0, 2.0]), criterion="A")
+    theta = request.theta.copy()
+    zero = {"Wuu": "X", "Wvv": "Y", "Wuv": "N"}
+    theta[[request.structure.index(n) for n in zero]] = 0.0
+    request = replace(request, theta=theta)
+    value = dict(zip(request.structure.parameters, np.abs(theta), strict=True))
+    alone = replace(request, wanted=("Wuu",))
+    for asked in (request, alone):
+        predictor = asked.build_predictor()
+        criterion = build_problem(asked).criterion
+        names = [predictor.columns[i].name for i in criterion.wanted]
+        for name, scale in zip(names, criterion.scale, strict=True):
+            others = [v for n, v in value.items() if n[0] == zero.get(name)]
+            expected = min(others) if others else value[name]
+            assert scale == pytest.approx(expected), name
+
+
 def test_an_unknown_criterion():
     with pytest.raises(UsageError, match="there is no criterion 'G'"):
         Criterion("G", (0,), np.ones(1), np.ones(1))
