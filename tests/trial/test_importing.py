@@ -246,6 +246,18 @@ def test_rows_out_of_order_and_twice():
     assert any("2 values of x_n repeat a time: the first is kept" in n for n in result.notes)
 
 
+def test_a_stretch_shorter_than_the_window_of_velocities_is_left_out():
+    data = {k: v.copy() for k, v in columns().items() if k not in ("u", "v", "r")}
+    for name in ("x_n", "y_n", "psi"):
+        data[name][np.r_[100:130, 135:160]] = np.nan
+    result = imported(data, velocities="savgol", window=6.0)
+    assert [len(s) for s in result.segments] == [98, 238]
+    # velocities that were measured need no window
+    assert len(imported(columns(), velocities="savgol", window=1e4).segments) == 1
+    with pytest.raises(LogError, match="a window of 10000 s holds 20001 samples"):
+        imported(data, velocities="savgol", window=1e4)
+
+
 def test_times_that_are_no_number_cost_their_rows_alone():
     data = columns()
     times = data["t"].copy()

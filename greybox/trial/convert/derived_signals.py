@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,8 +37,9 @@ _POLAR = (
 # how far wrapped radians reach, and the noise of a sensor
 _TURN = 2 * np.pi + 0.5
 # order of the polynomials of positions: the velocity may bend within the window
-_ORDER = 3
+POSITION_ORDER = 3
 _SMOOTHING_ORDER = 2
+_BODY, _EARTH, _PLACE = ("u", "v"), ("v_n", "v_e"), ("x_n", "y_n")
 
 
 def derive_signals(recording: Recording, origin: tuple[float, float] | None = None) -> Recording:
@@ -279,6 +280,12 @@ def _smooth(
     return steps
 
 
+def made_from_positions(names: Container[str]) -> bool:
+    """Whether u or v of a log with these channels is made from positions and heading."""
+    lacking = any(n not in names for n in _BODY) and any(n not in names for n in _EARTH)
+    return lacking and all(n in names for n in (*_PLACE, "psi"))
+
+
 def _velocities(
     part: dict[str, Array], vessel: Vessel, sample_time: float, options: ImportOptions
 ) -> list[Step]:
@@ -287,7 +294,7 @@ def _velocities(
     if psi is None:
         return []
     steps = []
-    missing = [n for n in ("u", "v") if n not in part]
+    missing = [n for n in _BODY if n not in part]
     turning = "r" not in part and len(psi) > 2
     if turning:
         part["r"] = np.gradient(psi, sample_time)
@@ -300,15 +307,19 @@ def _velocities(
         made = {"u": u + r * antenna[1], "v": v - r * antenna[0]}
         source = ("v_n", "v_e", "psi")
         steps.append(Step("earth_to_body", tuple(missing), source))
-    elif missing and {"x_n", "y_n"} <= part.keys() and len(psi) > 2:
+    elif made_from_positions(part) and len(psi) > 2:
         place = part["x_n"], part["y_n"], psi, sample_time
         std = vessel.std("psi") or 0.0
         source = ("x_n", "y_n", "psi")
         if options.velocities == "savgol":
             u, v, r = savgol_velocities(
-                *place, window_s=options.window, order=_ORDER, heading_std=std, antenna=antenna
+                *place,
+                window_s=options.window,
+                order=POSITION_ORDER,
+                heading_std=std,
+                antenna=antenna,
             )
-            how = {"window": options.window, "order": float(_ORDER)}
+            how = {"window": options.window, "order": float(POSITION_ORDER)}
             names = (*missing, *differenced)
             steps.append(Step("local_polynomials", names, source, how, decided_by="user"))
             if turning:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
+from greybox.trial.convert.derived_signals import POSITION_ORDER, made_from_positions
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.resample import Clock, covered, nice_period, resampled_by, stretches
 from greybox.trial.gaps import split_at_gaps
@@ -203,7 +204,7 @@ def plan_import(
         {n: e.period for n, e in used.items()},
         tuple(n for n in reference if n not in spare),
         tuple(notes),
-        max([MIN_SEGMENT, *_windows(options, count, sample_time)]),
+        max([MIN_SEGMENT, *_windows(options, used, count, sample_time)]),
         _resampling({n: e.period for n, e in used.items()}, sample_time, vessel),
     )
 
@@ -274,8 +275,12 @@ def _resampling(
     )
 
 
-def _windows(options: ImportOptions, count: int, sample_time: float) -> Iterator[int]:
-    """Yield the samples of each window of smoothing."""
+def _windows(
+    options: ImportOptions, names: Container[str], count: int, sample_time: float
+) -> Iterator[int]:
+    """Yield the samples of each window of smoothing, and of that which makes velocities."""
+    if options.velocities == "savgol" and made_from_positions(names):
+        yield window_samples(count, sample_time, options.window, POSITION_ORDER)
     for name, seconds in options.smooth.items():
         try:
             yield window_samples(count, sample_time, seconds)
