@@ -32,6 +32,7 @@ from experiment_design.optimise.search import assess
 from experiment_design.output.result import Design, PlanPart
 from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.request import PreparedRequest, build_problem
+from greybox.diagnosis.result import finite
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
@@ -63,7 +64,7 @@ class PredictionDesign:
         forces beyond the prior's terms that the trial does not tell.
     random : float
         Root mean squared error of the median of random sequences of the same length, over
-        that of the plan.
+        that of the plan; nan for several trials, where it is not known.
     commands : dict of str to (float, float)
         Range of each command in the envelope, in the log's unit, angles in rad.
     crossings : tuple of (float, float)
@@ -88,7 +89,7 @@ class PredictionDesign:
             "prediction": {
                 "error_by_noise": self.noise,
                 "error_by_misfit": self.misfit,
-                "random_error_over_this": self.random,
+                "random_error_over_this": finite(self.random),
                 "envelope": {n: list(r) for n, r in self.commands.items()},
                 "validation_share": self.validation_share,
                 "crossings": [list(c) for c in self.crossings],
@@ -108,9 +109,10 @@ class PredictionDesign:
         error = ", ".join(f"{n} {np.hypot(self.noise[n], self.misfit[n]):.2g}" for n in self.noise)
         said = (
             f"After this trial predictions over the operating envelope are expected to be off by "
-            f"{error} (rms, m/s and rad/s, where the estimate chooses its terms by this trial); "
-            f"after random steps of the same length by {self.random:.2f} times as much"
+            f"{error} (rms, m/s and rad/s, where the estimate chooses its terms by this trial)"
         )
+        if np.isfinite(self.random):
+            said += f"; after random steps of the same length by {self.random:.2f} times as much"
         if self.design.request.untried:
             said += (
                 ". No estimated model stands behind these numbers, only the ship's main "

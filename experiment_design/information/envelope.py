@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.excitation.schedule import Schedule
-from greybox.errors import InfeasibleError
+from greybox.errors import InfeasibleError, UsageError
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.model.run.step import StepModel
@@ -315,7 +315,8 @@ def build_envelope(
     schedule : Schedule
         With the commands' limits.
     commands : mapping of str to (float, float)
-        Range of each command that is used: speeds in the log's unit, angles [rad].
+        Range of each command that is used, as far as its limits go: speeds in the log's unit,
+        angles [rad].
     speeds : (float, float), optional
         Slowest and fastest surge that the prior's trial showed [m/s].
     misfit : ndarray
@@ -324,6 +325,8 @@ def build_envelope(
 
     Raises
     ------
+    UsageError
+        A range lies beyond the limits of its command.
     InfeasibleError
         The prior model holds the ship under too few of the commands.
     """
@@ -332,6 +335,13 @@ def build_envelope(
     lower, upper = np.array(
         [(max(a, commands[n][0]), min(b, commands[n][1])) for n, a, b in limits]
     ).T
+    for i in np.flatnonzero(lower > upper):
+        name, a, b = schedule.commands[i], schedule.lower[i], schedule.upper[i]
+        raise UsageError(
+            f"the envelope of {name}, {commands[name][0]:g} to {commands[name][1]:g}, lies beyond "
+            f"its limits, {a:g} to {b:g}: name a range within them, such as --envelope "
+            f"{name}={a:g}:{b:g}."
+        )
     dt, nx, length = rollout.sample_time, rollout.nx, rollout.vessel.length
     tried = lower + (upper - lower) * rng.random((_TRIED, len(lower)))
     shown = (-np.inf, np.inf)

@@ -25,7 +25,7 @@ from experiment_design.optimise.envelope_search import (
 )
 from experiment_design.request.request import build_problem
 from greybox.commands.main import main
-from greybox.errors import InfeasibleError
+from greybox.errors import InfeasibleError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
 from greybox.study.chapter6 import TRUE
@@ -38,7 +38,7 @@ def request_of(**changes):
     return make_request(**changes)
 
 
-def envelope_of(request, seed=0, speeds=None):
+def envelope_of(request, seed=0, speeds=None, **given):
     predictor = build_predictor(request.structure, "basic", (("u", (1, -1)),))
     rollout = Rollout(
         request.vessel, request.structure, request.theta, request.d, request.starts[0],
@@ -46,8 +46,9 @@ def envelope_of(request, seed=0, speeds=None):
     )  # fmt: skip
     ranges = {n: (float(v.lower), float(v.upper)) for n, v in request.vessel.limits.items()}
     return build_envelope(
-        rollout, predictor, request.noise, request.schedule, ranges, speeds, np.full(3, 0.2), seed
-    )
+        rollout, predictor, request.noise, request.schedule, ranges | given, speeds,
+        np.full(3, 0.2), seed,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -259,6 +260,14 @@ def test_a_plan_leaves_less_than_random_sequences(found) -> None:
     assert found.design.motions[0].state[0, :, 0].min() > 0.2 - 1e-3
 
 
+def test_random_steps_are_left_out_where_they_are_not_known(found) -> None:
+    said = f"; after random steps of the same length by {found.random:.2f} times as much"
+    assert said in found.headline()
+    several = replace(found, random=float("nan"))
+    assert several.headline() == found.headline().replace(said, "")
+    assert several.to_dict()["prediction"]["random_error_over_this"] is None
+
+
 def test_a_trial_begins_with_a_usual_manoeuvre_that_judges_the_estimate(found, envelope) -> None:
     validation, trial = found.to_dict()["parts"]
     assert (validation["part"], validation["from"]) == ("validation", 0.0)
@@ -289,6 +298,13 @@ def test_the_misfit_of_a_prior_is_what_its_verdict_says(model) -> None:
     share, level = prior_misfit(replace(model, record={}))
     assert (share == 0.3).all()
     assert level == ""
+
+
+def test_an_envelope_ends_at_the_limits_of_the_commands() -> None:
+    with pytest.raises(UsageError, match=r"of n, 25 to 30, lies beyond its limits, 10 to 20: name"):
+        envelope_of(request_of(), n=(25.0, 30.0))
+    found = envelope_of(request_of(), n=(15.0, 30.0))
+    assert (found.lower[0], found.upper[0]) == (15.0, 20.0)
 
 
 def test_ranges_are_those_of_the_trial_to_both_sides(model) -> None:
