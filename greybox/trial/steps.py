@@ -157,10 +157,12 @@ def new_steps(known: Iterable[Step], more: Iterable[Step]) -> tuple[Step, ...]:
 
 def on_zero(step: Step, shift: float) -> Step:
     """Return a step with the times that it names counted from another zero, `shift` earlier."""
-    if step.operation != "pad_fractions":
-        return step
-    times = tuple(t + shift for t in step.numbers("times"))
-    return replace(step, parameters={**step.parameters, "times": times})
+    parameters, interval = dict(step.parameters), step.interval
+    if "times" in parameters:
+        parameters["times"] = tuple(t + shift for t in step.numbers("times"))
+    if interval is not None:
+        interval = (interval[0] + shift, interval[1] + shift)
+    return replace(step, parameters=parameters, interval=interval)
 
 
 def mend(operation: str, channels: tuple[str, ...], **parameters: Value) -> Step:

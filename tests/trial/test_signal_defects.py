@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,8 +19,10 @@ from greybox.trial.checks.position_jump import jump_findings
 from greybox.trial.checks.signal_quality import coarse_findings, spike_findings
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.convert.derived_signals import continuous
+from greybox.trial.convert.merge import merge
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs
+from greybox.trial.steps import mend
 from greybox.trial.trial_summary import describe_recording
 from greybox.vessel.toml import vessel_from_dict
 
@@ -220,9 +223,18 @@ def test_a_cut_moves_with_its_positions():
     assert apply_repairs(cut, [_shift(("u", "v"), 0.8)]).cuts == cut.cuts
 
 
+def test_a_cut_moves_with_the_file_that_is_merged():
+    t = np.arange(100.0)
+    first = replace(as_recording({"t": t, "u": 0 * t}), epoch=1000.0)
+    cut = replace(mend("cut", ("x_n", "y_n"), times=(50.0,)), interval=(40.0, 60.0))
+    later = replace(first, name="later", epoch=2000.0, steps=(cut,))
+    merged = merge([first, later])
+    assert merged.cuts == (1050.0,)
+    assert merged.steps[0].interval == (1040.0, 1060.0)
+
+
 def _shift(channels, late):
     from greybox.trial.checks.finding import Finding
-    from greybox.trial.steps import mend
 
     repair = (mend("shift", channels, late=late),)
     return Finding("clock_offset", channels[0], late, (late, late), "s", "", "", channels, repair)
