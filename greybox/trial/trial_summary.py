@@ -93,7 +93,7 @@ def describe_logs(segments: Sequence[TrialLog]) -> Contents:
         if states:
             margins = {n: _MARGIN * float(abs(log[n]).mean()) for n in states}
             for s in by_sign(log, margins, shortest=_SHORTEST):
-                regimes[s.label] = regimes.get(s.label, 0.0) + s.t_stop - s.t_start
+                regimes[s.label] = regimes.get(s.label, 0.0) + len(s) * log.sample_time
     return Contents(tuple(manoeuvres), regimes, seconds)
 
 

@@ -24,6 +24,7 @@ from greybox.trial.manoeuvres import (
     measure_turning_circle,
     measure_zigzag,
 )
+from greybox.trial.manoeuvres.approach import measure_approach
 from greybox.trial.manoeuvres.local import fit_at, noise_std
 from greybox.trial.manoeuvres.standards import (
     check_limit,
@@ -31,6 +32,7 @@ from greybox.trial.manoeuvres.standards import (
     second_overshoot_limit,
 )
 from greybox.trial.manoeuvres.track import make_track, path_length
+from greybox.trial.trial_summary import describe_logs
 from greybox.vessel.toml import vessel_from_dict
 
 DEG = math.pi / 180
@@ -558,6 +560,26 @@ def test_verdicts_by_the_interval():
     assert "the log ends before it" in check_limit("x", None, 4.5).summary()
     # with few degrees of freedom the interval is wider
     assert check_limit("x", Quantity(4.2, 0.1, "1", 2), 4.5).verdict is Compliance.OPEN
+
+
+@pytest.mark.parametrize("speed", [1.0, 5.0])
+def test_the_approach_of_a_short_ship_is_at_least_its_last_five_samples(speed):
+    t = np.arange(100.0)
+    turned = np.maximum(t - 60, 0) * 0.1
+    course = 0.3 + 1e-3 * np.sin(40 * t)
+    a = measure_approach(t, course + turned, speed + 0 * t, 0 * t, 60.0, 10.0)
+    assert a.seen
+    assert a.heading.value == pytest.approx(0.3, abs=1e-3)
+    assert a.heading.dof == (10 if speed == 1.0 else 4)
+    assert not measure_approach(t[57:], course[57:], speed + 0 * t[57:], 0 * t[57:], 60.0, 10).seen
+
+
+def test_the_seconds_of_sign_regimes_add_up():
+    n = 600
+    u = np.where((np.arange(n) // 6) % 2 == 0, 1.0, -1.0)
+    log = make_log(rudder_ship(), {"u": u, "v": np.full(n, 0.5), "r": 0 * u, "psi": 0 * u} | {
+        "n": 0 * u, "delta": 0 * u}, 1.0)  # fmt: skip
+    assert describe_logs([log]).regimes == {"u+v+": 300.0, "u-v+": 300.0}
 
 
 def test_misuse_is_told(turn_run):

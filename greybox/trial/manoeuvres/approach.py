@@ -52,6 +52,8 @@ def measure_approach(
 ) -> Approach:
     """Measure original heading and speed over the last ship length before the order.
 
+    Over the last five samples, where a ship length has fewer.
+
     Parameters
     ----------
     t, psi, u, v : ndarray
@@ -82,7 +84,9 @@ def measure_approach(
     near = slice(max(0, k - _FEWEST), k + _FEWEST)
     rough = float(np.median(np.hypot(u[near], v[near])))
     run = length / max(rough, 1e-9)
-    before = np.flatnonzero((t >= start - run) & (t <= start))
+    # a short ship sails its length within a few samples
+    first = min(int(np.searchsorted(t, start - run)), k - _FEWEST)
+    before = np.arange(max(first, 0), k)
     seen = len(before) >= _FEWEST
     if seen:
         ones = np.ones((len(before), 1))
