@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 
 import casadi as ca
 
@@ -35,12 +36,12 @@ def gradient_of(text: str, values: Mapping[str, float]) -> dict[str, float]:
     try:
         if len(text) > _LONGEST:
             raise SyntaxError
-        tree = ast.parse(text, mode="eval")
+        tree = _parsed(text, values)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise UsageError(
             f"--of '{text[:60]}' cannot be read: write a parameter, or a formula such as Xuu/Xmu."
         ) from error
-    expression = _read(tree.body, symbols, text)
+    expression = _read(tree, symbols, text)
     names = list(symbols)
     x = ca.vertcat(*symbols.values())
     slope = ca.Function("slope", [x], [ca.gradient(expression, x)])
@@ -52,6 +53,18 @@ def gradient_of(text: str, values: Mapping[str, float]) -> dict[str, float]:
             f"that depends on them there."
         )
     return out
+
+
+def _parsed(text: str, names: Iterable[str]) -> ast.expr:
+    """Return the tree of an expression, in which names such as ``N_|r|r`` are names."""
+    places = {f"__{i}__": n for i, n in enumerate(n for n in names if not n.isidentifier())}
+    for place, name in places.items():
+        text = re.sub(rf"(?<![\w|]){re.escape(name)}(?![\w|])", place, text)
+    tree = ast.parse(text, mode="eval")
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name):
+            node.id = places.get(node.id, node.id)
+    return tree.body
 
 
 def _read(node: ast.expr, symbols: Mapping[str, ca.SX], text: str) -> ca.SX:

@@ -498,7 +498,14 @@ def test_functions_of_the_parameters():
     found = gradient_of("-Xuu/Xmu + sqrt(Xmu)**2", values)
     assert found["Xuu"] == pytest.approx(-50.0)
     assert found["Xmu"] == pytest.approx(-0.05 / 0.02**2 + 1)
+    values |= {"N_|r|r": -2.0, "Y_|r|v": 0.5, "Nr": 4.0}
+    assert gradient_of("N_|r|r", values) == {"N_|r|r": 1.0}
+    found = gradient_of("N_|r|r/Nr - 3*Y_|r|v", values)
+    assert found == pytest.approx({"N_|r|r": 0.25, "Nr": 2 / 16, "Y_|r|v": -3.0})
+    with pytest.raises(UsageError, match=r"The model has: Xuu, Xmu, N_\|r\|r, Y_\|r\|v, Nr\.$"):
+        gradient_of("N_|r|r + Nq", values)
     for text in (
+        "N_|r|q/Nr",
         "__import__('os')",
         "Xuu.real",
         "(lambda: 1)()",
