@@ -100,7 +100,7 @@ def build_regression(
     LogError
         A channel is missing, or sample times differ.
     ExcitationError
-        There are fewer rows than parameters in an equation.
+        An equation has no more than twice as many rows as coefficients.
 
     References
     ----------

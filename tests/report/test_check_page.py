@@ -139,7 +139,7 @@ def row_case(name):
     recording = as_recording(c)
     make = {
         "gap": time_findings, "duplicate_time": time_findings, "nan": missing_findings,
-        "outlier": spike_findings, "stuck": lambda r: stuck_findings(r, SHIP),
+        "outlier": spike_findings, "stuck": stuck_findings,
         "quantised": coarse_findings, "unit": lambda r: angle_unit_findings(r, SHIP),
         "heading_wrap": wrap_findings, "position_hold": hold_findings,
         "position_jump": jump_findings,

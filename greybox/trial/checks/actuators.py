@@ -609,11 +609,11 @@ def _estimate(fit: _Fit, pairs: Sequence[_Pair], actuator: Actuator) -> Actuator
         again = _improve(fit.theta, fit.free, fit.fresh, actuator.kind)
         again = replace(again, covariance=_covariance(again, fit.fresh, actuator.kind))
         new = (
-            _measured(again, _D, fit.fresh, actuator.kind),
-            _measured(again, _T, fit.fresh, actuator.kind),
+            _measured(again, _D, fit.fresh),
+            _measured(again, _T, fit.fresh),
         )
-    delay = _measured(fit, _D, pairs, actuator.kind)
-    lag = _measured(fit, _T, pairs, actuator.kind)
+    delay = _measured(fit, _D, pairs)
+    lag = _measured(fit, _T, pairs)
     response = delay.value + lag.value
     spread = _NORMAL * float(np.sqrt(max(fit.covariance[:2, :2].sum(), 0.0)))
     sums = [float(x[_D] + x[_T]) for x in fit.alike]
@@ -627,10 +627,10 @@ def _estimate(fit: _Fit, pairs: Sequence[_Pair], actuator: Actuator) -> Actuator
         delay,
         lag,
         Measured(response, between),
-        _measured(fit, _G, pairs, actuator.kind),
-        _measured(fit, _O, pairs, actuator.kind),
-        _measured(fit, _R, pairs, actuator.kind) if limited else None,
-        _measured(fit, _B, pairs, actuator.kind) if fit.theta[_B] else None,
+        _measured(fit, _G, pairs),
+        _measured(fit, _O, pairs),
+        _measured(fit, _R, pairs) if limited else None,
+        _measured(fit, _B, pairs) if fit.theta[_B] else None,
         fit.scale,
         max(p.step for p in pairs),
         fit.hold,
@@ -639,7 +639,7 @@ def _estimate(fit: _Fit, pairs: Sequence[_Pair], actuator: Actuator) -> Actuator
     )
 
 
-def _measured(fit: _Fit, k: int, pairs: Sequence[_Pair], kind: ActuatorKind) -> Measured:
+def _measured(fit: _Fit, k: int, pairs: Sequence[_Pair]) -> Measured:
     """Return a parameter with its interval."""
     value = float(fit.theta[k])
     if k == _B and k not in fit.free:

@@ -213,7 +213,7 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
     measured = _independent(log.mended)
     log.add(
         [
-            *stuck_findings(measured, vessel),
+            *stuck_findings(measured),
             *spike_findings(measured),
             *coarse_findings(measured),
         ]

@@ -456,7 +456,7 @@ def quantum(value: Array) -> float:
     return step if len(other) and np.mean(other < 0.1) > 0.5 else 0.0
 
 
-def stuck_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
+def stuck_findings(recording: Recording) -> list[Finding]:
     """Find signals that repeat one value while the ship moves by the others."""
     found = []
     signals = list(_motion(recording))

@@ -248,7 +248,7 @@ def measure_turning_circle(
         _, tactical, time_180 = _at(frame, approach, half, scale, start_std)
     if full is not None:
         _, _, time_360 = _at(frame, approach, full, scale, start_std)
-    steady = _steady(t, psi, own, u, v, track, start, stop, direction, heading_std)
+    steady = _steady(t, psi, own, u, v, track, start, stop, heading_std)
     loss = None
     if steady is not None:
         notes += steady.notes
@@ -380,7 +380,6 @@ def _steady(
     track: Track,
     start: float,
     stop: float,
-    direction: int,
     heading_std: float | None,
 ) -> _SteadyTurn | None:
     """Measure the last full circle, or what there is of it past 180 degrees."""

@@ -161,7 +161,7 @@ def _estimate(logs: Sequence[Evidence], splits: Sequence[Split], prior: Array) -
         covariance = np.linalg.inv(total)
         value = covariance @ pull
         offsets = [c @ value for c in chosen]
-        scatter = _scatter(logs, offsets, size)
+        scatter = _scatter(logs, offsets)
     return _Estimate(value, covariance, scatter, [c @ value for c in chosen])
 
 
@@ -188,7 +188,7 @@ def _deviations(
     return drawn / np.maximum(weight, 1e-12), weight
 
 
-def _scatter(logs: Sequence[Evidence], offsets: Sequence[Array], parameters: int) -> Array:
+def _scatter(logs: Sequence[Evidence], offsets: Sequence[Array]) -> Array:
     """Return the standard deviation of each offset between logs (DerSimonian and Laird)."""
     out = np.zeros(SIZE)
     for k in range(SIZE):
