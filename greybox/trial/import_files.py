@@ -8,9 +8,11 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from greybox.errors import LogError
+from greybox.files import check_targets
 from greybox.trial.checks.actuators import measure_actuators
 from greybox.trial.checks.check import check_recordings
 from greybox.trial.checks.signal_quality import angle_unit_findings
@@ -87,17 +89,17 @@ def import_files(
     for path in paths:
         _keep_source(path, [target for _, target in trials])
     summaries = []
-    with _all_or_none(folder, [target for _, target in trials]):
+    with _all_or_none(folder, [target for _, target in trials]) as logs:
         if not mending:
-            for files, target in trials:
+            for (files, _), target in zip(trials, logs, strict=True):
                 summaries.append(_import_trial(files, vessel, target, options, reader, extra))
         else:
             recordings = [read_trial(files, vessel, **(reader or {})) for files, _ in trials]
             reports = check_recordings(recordings, vessel)
             while recordings:
-                recording, (_, target) = recordings.pop(0), trials[len(summaries)]
+                recording, target = recordings.pop(0), logs[len(summaries)]
                 mended, fixed, left = repair(
-                    recording, vessel, reports[len(summaries)], also=fix_also, without=fix_not
+                    recording, reports[len(summaries)], also=fix_also, without=fix_not
                 )
                 lines = [f"mended: {n}" for n in fixed] + [f"left as it is: {n}" for n in left]
                 summaries.append(_write(mended, vessel, target, options, extra, lines))
@@ -132,10 +134,10 @@ def targets(paths: Sequence[str | Path], out: str | Path) -> list[Path]:
 
 
 @contextmanager
-def _all_or_none(folder: Path | None, logs: Sequence[Path]) -> Iterator[None]:
-    """Make a folder of logs, and take back what is new where one of them cannot be made."""
+def _all_or_none(folder: Path | None, logs: Sequence[Path]) -> Iterator[list[Path]]:
+    """Make a folder of logs, and yield where to write them: they are there once all are made."""
     if folder is None:
-        yield
+        yield list(logs)
         return
     if not folder.absolute().parent.is_dir():
         raise LogError(
@@ -143,7 +145,6 @@ def _all_or_none(folder: Path | None, logs: Sequence[Path]) -> Iterator[None]:
             f"in. Name a folder in one that exists."
         )
     made = not folder.exists()
-    new = [p for log in logs for p in (log, record_path(log)) if not p.exists()]
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
@@ -152,10 +153,12 @@ def _all_or_none(folder: Path | None, logs: Sequence[Path]) -> Iterator[None]:
             f"or one log that ends in .csv or .parquet."
         ) from None
     try:
-        yield
+        check_targets(*logs, *map(record_path, logs))
+        with TemporaryDirectory(prefix=".import-", dir=folder) as beside:
+            yield [Path(beside) / log.name for log in logs]
+            for path in sorted(Path(beside).iterdir()):
+                path.replace(folder / path.name)
     except BaseException:
-        for path in new:
-            path.unlink(missing_ok=True)
         if made:
             folder.rmdir()
         raise

@@ -15,7 +15,6 @@ from greybox.trial.convert.derived_signals import continuous, derive_signals
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import Step, mend
 from greybox.trial.time_format import unpadded_numbers
-from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
@@ -27,7 +26,6 @@ _ONCE = frozenset({"shift", "turn_heading", "move_antenna", "earth_to_body"})
 
 def repair(
     recording: Recording,
-    vessel: Vessel,
     report: CheckReport,
     *,
     also: tuple[str, ...] = (),
@@ -39,7 +37,6 @@ def repair(
     ----------
     recording : Recording
         As it was checked.
-    vessel : Vessel
     report : CheckReport
     also : tuple of str
         Ids of findings to mend although they need judgement.

@@ -369,7 +369,7 @@ def test_two_runs_in_one_file_are_found_and_not_mended(offset, ship):
     assert f"goes back, from 100 to {offset:g} s, where a second run begins" in found.evidence
     assert found.fix == "cut the file there and import each run"
     with pytest.raises(LogError, match=r"are there twice: cut the file there and import each run"):
-        import_recording(repair(log, ship, check_recording(log, ship))[0], ship)
+        import_recording(repair(log, check_recording(log, ship))[0], ship)
 
 
 def test_gap_nan_spike_stuck(ship):
@@ -386,7 +386,7 @@ def test_gap_nan_spike_stuck(ship):
     assert (f["outlier"].channel, f["outlier"].value) == ("u", pytest.approx(1.0, abs=0.06))
     assert (f["nan"].channel, f["nan"].value) == ("psi", 12)
     assert (f["stuck"].channel, f["stuck"].value) == ("x_n", pytest.approx(19.8))
-    mended, fixed, left = repair(as_recording(d), ship, check_recording(as_recording(d), ship))
+    mended, fixed, left = repair(as_recording(d), check_recording(as_recording(d), ship))
     assert len(fixed) == 3
     assert not left
     assert set(found_ids(mended, ship)) == {"gap"}
@@ -414,15 +414,15 @@ def test_coarse_values(ship):
 def test_fixes_that_need_judgement_are_left(ship):
     log = as_recording(recorded(80, 2.0, heading_bias=0.1))
     report = check_recording(log, ship)
-    same, fixed, left = repair(log, ship, report)
+    same, fixed, left = repair(log, report)
     assert not fixed
     assert left[0].startswith("heading_bias (psi): subtract")
     np.testing.assert_array_equal(same["psi"].value, log["psi"].value)
-    mended, fixed, _ = repair(log, ship, report, also=("heading_bias",))
+    mended, fixed, _ = repair(log, report, also=("heading_bias",))
     assert len(fixed) == 1
     assert not check_recording(mended, ship).findings
     with pytest.raises(UsageError, match=r"no check .heading_bais.\. Did you mean .heading_bias."):
-        repair(log, ship, report, also=("heading_bais",))
+        repair(log, report, also=("heading_bais",))
 
 
 def test_signals_on_their_own_clocks(ship):

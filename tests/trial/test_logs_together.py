@@ -57,7 +57,7 @@ def test_instruments_are_estimated_once_over_all_logs(ship):
     for f in alone.values():
         assert width < 0.75 * np.diff(f.ci)[0]
         assert "logs" not in f.to_dict()
-    mended = [repair(r, ship, report)[0] for r, report in zip(recordings, reports, strict=True)]
+    mended = [repair(r, report)[0] for r, report in zip(recordings, reports, strict=True)]
     assert not any(r.findings for r in check_recordings(mended, ship))
 
 
@@ -161,8 +161,8 @@ def test_mends_that_contradict_are_refused_with_both_values(ship):
     (r,) = logs_of([70], seconds=60.0)
     two = planted(mend("shift", ("psi",), late=0.5), mend("shift", ("psi",), late=0.9))
     with pytest.raises(LogError, match=r"psi moved by -0\.5 s.*psi moved by -0\.9 s.*--fix-not"):
-        repair(r, ship, two)
-    left = repair(r, ship, two, without=("clock_offset",))
+        repair(r, two)
+    left = repair(r, two, without=("clock_offset",))
     assert not left[1]
     assert len(left[2]) == 2
 
@@ -171,17 +171,17 @@ def test_a_mend_that_would_leave_too_little_is_refused_with_both_numbers(ship):
     (r,) = logs_of([70], seconds=60.0)
     times = tuple(float(t) for t in r["psi"].t[2:])
     with pytest.raises(LogError, match=r"of psi .* leave 2 of its 121 samples"):
-        repair(r, ship, planted(mend("drop", ("psi",), times=times), ids=("outlier",)))
+        repair(r, planted(mend("drop", ("psi",), times=times), ids=("outlier",)))
     with pytest.raises(LogError, match=r"of psi .* leave 0 of its 121 samples"):
-        repair(r, ship, planted(mend("shift", ("psi",), late=600.0)))
+        repair(r, planted(mend("shift", ("psi",), late=600.0)))
 
 
 def test_ids_are_known_and_not_asked_for_twice(ship):
     (r,) = logs_of([70], seconds=60.0)
     with pytest.raises(UsageError, match="no check 'clock'"):
-        repair(r, ship, planted(), without=("clock",))
+        repair(r, planted(), without=("clock",))
     with pytest.raises(UsageError, match="'gap' stands in --fix-also and in --fix-not"):
-        repair(r, ship, planted(), also=("gap",), without=("gap",))
+        repair(r, planted(), also=("gap",), without=("gap",))
 
 
 @pytest.fixture
@@ -223,6 +223,12 @@ def test_a_folder_is_left_as_it_was_where_one_file_fails(trials, tmp_path, ship)
     with pytest.raises(LogError):
         import_files([*trials, bad], ship, tmp_path / "new")
     assert not (tmp_path / "new").exists()
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "run0.csv").write_text("as it was")
+    with pytest.raises(LogError):
+        import_files([*trials, bad], ship, tmp_path / "old")
+    (left,) = (tmp_path / "old").iterdir()
+    assert left.read_text() == "as it was"
     with pytest.raises(LogError, match="would both become"):
         import_files([trials[0], trials[0]], ship, tmp_path / "new")
     with pytest.raises(LogError, match="is also the log to write"):
