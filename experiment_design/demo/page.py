@@ -74,7 +74,7 @@ def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
         sentences=[
             "Each step below shows the command that does it; the files that it reads and writes "
             "stand beside this page, so that every step can be taken again by hand.",
-            *([noise_sentence(budget, diagnosis.gain)] if budget else []),
+            *([noise_sentence(diagnosis)] if budget else []),
         ],
         lead=gain,
         next_steps=[

@@ -21,6 +21,7 @@ from greybox.diagnosis.causes import Cause
 from greybox.diagnosis.evidence.confusion import rivals
 from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.evidence.kinematics import denied
+from greybox.diagnosis.evidence.remainder import generic_force
 from greybox.diagnosis.evidence.standing import standing
 from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.fitting import Problem
@@ -52,7 +53,7 @@ from greybox.numerics.parallel import map_forked
 from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
 from greybox.trial.validity import ranges
-from greybox.validation.bands import LEVEL, predict_bands
+from greybox.validation.bands import LEVEL, Z, predict_bands
 from greybox.validation.fit import LogFit, fit_on
 
 Array = NDArray[np.float64]
@@ -87,10 +88,32 @@ class DiagnosisBuilder:
     def model(self, fit: Fit, record: Mapping[str, Any]) -> ManoeuvringModel:
         """Return a hypothesis as a model."""
         problem = self.case.problem(fit.integrator)
-        made = extended_model(self.structure, problem, fit, self.case.logs, record, self.current)
         if self.found.base is fit and self.given is not None:
             return self.given
-        return made
+        misfit = self._misfit(fit) if fit is self.found.final else 0.0
+        return extended_model(
+            self.structure, problem, fit, self.case.logs, record, self.current, misfit
+        )
+
+    def _misfit(self, fit: Fit) -> Array | float:
+        """Return the covariance (q, q) of the final fit's numbers by what a generic force moves.
+
+        With it the model's standard errors are those that are told of its causes.
+        """
+        pairs = self.case.held_out(fit.integrator).pairs(fit)
+        bounded = [p for p in pairs if not (p.fit.escaped or p.held_fit.escaped)]
+        if not self.found.causes or not bounded:
+            return 0.0
+        moved = np.mean([generic_force(p).moved for p in bounded], axis=0)
+        out = np.outer(moved, moved)
+        problem = self.case.problem(fit.integrator)
+        for cause in self.found.causes:
+            if cause.standing is None:
+                continue
+            where = problem.numbers_of(fit.point, cause.hypothesis)
+            for i, by in zip(where, cause.standing.moved, strict=True):
+                out[i, i] = max(out[i, i], by**2)
+        return np.asarray(out)
 
     @property
     def fit_told(self) -> Fit:
@@ -325,11 +348,17 @@ class DiagnosisBuilder:
                 "'before' is the model as it was given; with a cause its coefficients are "
                 "estimated again, so a cause is only what other coefficients cannot explain."
             )
-        turned = backwards(self.found.final, self.case.universe.parameters)
+        sure = {
+            n for n, value, std in zip(after.names, after.theta, after.std, strict=True)
+            if abs(value) > Z * std
+        }  # fmt: skip
+        turned = [
+            n for n in backwards(self.found.final, self.case.universe.parameters) if n in sure
+        ]
         if turned:
             out.append(
                 f"{', '.join(turned)} came out negative: some thruster's column has the wrong sign "
-                f"or stands in another's place; greybox check tells which."
+                f"or stands in another's place; greybox check may tell which."
             )
         if any(self.found.final.point.ship.sensors.lever):
             out.append(

@@ -46,6 +46,7 @@ def extended_model(
     logs: Sequence[TrialLog],
     record: Mapping[str, Any],
     known_current: Mapping[str, tuple[float, float]],
+    misfit: Array | float = 0.0,
 ) -> ManoeuvringModel:
     """Return the hypothesis as a model that every command takes.
 
@@ -62,10 +63,12 @@ def extended_model(
         What the model file tells beside.
     known_current : mapping of str to (float, float)
         Current of the model that was diagnosed, where it has one.
+    misfit : ndarray or float
+        (q, q) covariance of the free numbers by what the model lacks.
     """
     wide = extended_structure(structure, problem, fit)
     ship = fit.point.ship
-    _, covariance = problem.covariance(fit)
+    covariance = problem.covariance(fit)[1] + misfit
     where = {problem.names[i]: k for k, i in enumerate(fit.point.places)}
     theta = np.array([ship.theta[problem.place(n)] for n in wide.parameters])
     index = [where.get(n) for n in wide.parameters]

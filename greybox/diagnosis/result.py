@@ -489,13 +489,30 @@ def _budget_lines(budget: Sequence[BudgetPart]) -> list[str]:
         return []
     states = list(budget[0].share)
     shown = [p for p in budget if any(abs(v) >= _SHOWN for v in (*p.share.values(),))]
-    head = "".join(f"{s:>24}" for s in states)
+    cells = [["", *states], *([p.part, *(_share(p, s) for s in states)] for p in shown)]
+    first, *wide = (max(map(len, column)) + 2 for column in zip(*cells, strict=True))
+    lines = [
+        f"  {part:<{first}}" + "".join(f"{v:>{w}}" for v, w in zip(row, wide, strict=True))
+        for part, *row in cells
+    ]
     return [
         "",
         "Sources of the squared held-out error [%], before the model is extended (95 %):",
-        f"  {'':<22}{head}",
-        *(f"  {p.part:<22}" + "".join(f"{_share(p, s):>24}" for s in states) for p in shown),
+        *lines,
+        *([f"  {told}"] if (told := hardly_split(budget)) else []),
     ]
+
+
+def hardly_split(budget: Sequence[BudgetPart]) -> str:
+    """Return a sentence on states of whose error more cannot be split than there is."""
+    rest = budget[-1].share
+    beyond = [s for s, share in rest.items() if abs(share) > 1]
+    if not beyond:
+        return ""
+    return (
+        f"Of {', '.join(beyond)} the parts do not add up to the error: causes act against each "
+        f"other there, or its error is small, so their shares say little."
+    )
 
 
 def _share(part: BudgetPart, state: str) -> str:

@@ -274,13 +274,20 @@ def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> st
     tail = f" In these logs {moved}." if moved else ""
     if why:
         return f"What is left is not only noise: {why}.{tail}"
+    missed = {s: m for s, m in _missed(pairs).items() if m > NEAR}
+    if missed:
+        told = ", ".join(f"{word(s)} by {m:.0f}" for s, m in missed.items())
+        tail = (
+            f" The held-out free run still misses {told} times what its sensor's noise explains, "
+            f"as gusts do.{tail}"
+        )
     if left.proof.p_value < SURE and left.explicable > 0:
         return (
-            f"What is left is hardly more than noise: forces that belong to no known cause would "
-            f"explain another {100 * left.explicable:.1f} % of the squared errors "
-            f"(p = {left.proof.p_value:.1g}), too little to matter.{tail}"
+            f"What is left follows hardly anything that is known of the motion: forces that belong "
+            f"to no known cause would explain another {100 * left.explicable:.1f} % of the squared "
+            f"errors (p = {left.proof.p_value:.1g}), too little to matter.{tail}"
         )
-    return f"What is left cannot be told from noise.{tail}"
+    return f"What is left cannot be told from {'gusts' if missed else 'noise'}.{tail}"
 
 
 def _next(verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]]) -> list[str]:

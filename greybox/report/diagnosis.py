@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from greybox.diagnosis.result import Diagnosis, Runs
+from greybox.diagnosis.result import Diagnosis, Runs, hardly_split
 from greybox.report.chart import chart_of
 from greybox.report.diagnosed_causes import cause_section, probability
 from greybox.report.diagnosis_figures import (
@@ -110,7 +110,7 @@ def _summary(diagnosis: Diagnosis) -> list[str]:
         )
         told.append(f"The fit of the free run (100 % is perfect) changes: {gains}.")
     if diagnosis.budget:
-        told.append(noise_sentence(diagnosis.budget, diagnosis.gain))
+        told.append(noise_sentence(diagnosis))
     return told
 
 
@@ -182,6 +182,7 @@ def _budget(diagnosis: Diagnosis) -> Iterator[Picture]:
         )
         if cut_off(diagnosis.budget):
             caption += " Shares beyond the picture's edge stand in the table of the budget."
+        caption += f" {told}" if (told := hardly_split(diagnosis.budget)) else ""
         told = f"{caption} Largest part of {largest(diagnosis.budget)}."
         yield narrow(budget_figure(diagnosis.budget), "budget", caption, told)
 

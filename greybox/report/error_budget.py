@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from greybox.diagnosis.budget import SENSOR
-from greybox.diagnosis.result import BudgetPart, Gain
+from greybox.diagnosis.result import BudgetPart, Diagnosis
 from greybox.report.figures import BLUE, LABELS, ORANGE, new_figure, tidy
 from greybox.report.page import Table
+from greybox.validation.fit import fit_percent
 
 # inches: letters stay legible where the page is 390 px wide
 _WIDTH = 4.4
@@ -80,23 +81,21 @@ def largest(budget: Sequence[BudgetPart]) -> str:
     return "; ".join(told)
 
 
-def noise_sentence(budget: Sequence[BudgetPart], gain: Mapping[str, Gain]) -> str:
-    """Return how much of the error that is left is noise, and the fit that noise alone allows.
-
-    Parameters
-    ----------
-    budget : sequence of BudgetPart
-    gain : mapping of str to Gain
-        Fit (6.12) of the free run [%], by state.
-    """
+def noise_sentence(diagnosis: Diagnosis) -> str:
+    """Return how much of the error that is left is noise, and the fit that noise alone allows."""
+    budget, noise = diagnosis.budget, diagnosis.model.noise
     (sensor,) = (p for p in budget if p.part == SENSOR)
+    held = [run.measured for run in diagnosis.runs if run.held_out]
     told, bounds = [], []
-    for state, noise in sensor.after.items():
-        share = min(max(noise / max(sum(p.after[state] for p in budget), 1e-300), 0.0), 1.0)
+    for state, own in sensor.after.items():
+        share = min(max(own / max(sum(p.after[state] for p in budget), 1e-300), 0.0), 1.0)
         name = LABELS.get(state, state).split(" ")[0] if state != "r" else "yaw rate"
         told.append(f"{name} {100 * share:.0f} %")
-        if state in gain:
-            bounds.append(f"{name} {100 - (100 - gain[state].after) * share**0.5:.0f} %")
+        if noise is not None and held:
+            std = float(noise.measurement[noise.states.index(state)])
+            least = np.concatenate([np.full(len(one[state]), std) for one in held])
+            measured = np.concatenate([one[state] for one in held])
+            bounds.append(f"{name} {max(fit_percent(measured, measured - least), 0.0):.0f} %")
     said = f"Sensor noise makes up this much of the squared error that is left: {', '.join(told)}"
     if bounds:
         said += (

@@ -65,7 +65,9 @@ def test_command_writes_what_the_contract_says(written: Path, capsys) -> None:
     assert page.count("the free-run error of surge is white") == 2
     schema("model-4").validate(json.loads((written / "m.json").read_text()))
     model = load_model(written / "m.json")
-    assert model.disturbances["current_north"][0] == cause["parameters"]["current_north"]["value"]
+    for name, (value, std) in model.disturbances.items():
+        assert value == cause["parameters"][name]["value"]
+        assert std == pytest.approx(cause["parameters"][name]["std"], rel=1e-6)
     # the extended model is an ordinary one: compare gives the same fit
     assert main(["compare", str(written / "m.json"), "--log", at[2], "--json", str(written / "c"),
                  "--no-bands"]) == 0  # fmt: skip

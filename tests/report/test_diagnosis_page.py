@@ -23,6 +23,7 @@ from greybox.diagnosis.result import (
 )
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel
+from greybox.model.noise import NoiseLevels
 from greybox.model.run.changes import Change
 from greybox.notebook import with_error
 from greybox.report.diagnosed_causes import probability
@@ -248,15 +249,31 @@ def test_none(pages, written, told):
 
 
 def test_whose_the_error_is_stands_in_bars_and_numbers(told):
-    page = diagnosis_page(replace(diagnosis_of("named"), budget=BUDGET), RECORD)
+    named = diagnosis_of("named")
+    noise = NoiseLevels(("u", "v", "r"), np.full(3, 0.014), np.zeros(3), 0.0, 0.0, "test")
+    named = replace(named, budget=BUDGET, model=replace(named.model, noise=noise))
+    page = diagnosis_page(named, RECORD)
     assert "Sources of the squared error" in page.lead.caption
     assert "surge u: current 70 %" in page.lead.alternative
     assert "70.0 (65.0 to 75.0)" in text_of(without_scripts(render(page)))
     assert "Sources of the squared" not in told["named"]
-    # 0.1 of 0.3 that are left; a fit of 88.1 % leaves an error of 11.9 %
+    # 0.1 of 0.3 that are left; a perfect model misses by the noise alone
     said = " ".join(page.sentences)
     assert "that is left: surge 33 %, sway 33 %, yaw rate 33 %" in said
-    assert f"about surge {100 - 11.9 * (1 / 3) ** 0.5:.0f} %" in said
+    surge = np.concatenate([run.measured["u"] for run in named.runs if run.held_out])
+    assert f"about surge {100 * (1 - 0.014 / surge.std()):.0f} %" in said
+
+
+def test_parts_that_do_not_add_up_are_said_to():
+    budget = (*BUDGET[:-1], replace(BUDGET[-1], share={"u": 0.2, "v": 0.2, "r": -23.1}))
+    named = replace(diagnosis_of("named"), budget=budget)
+    told = "Of r the parts do not add up to the error"
+    assert told in diagnosis_page(named, RECORD).lead.caption
+    lines = named.summary().splitlines()
+    assert any(told in line for line in lines)
+    (shown,) = (line for line in lines if line.startswith("  not split"))
+    assert shown.count("  20.0 (") == 2
+    assert "  -2310.0 (" in shown
 
 
 def test_confused(told):
