@@ -17,7 +17,7 @@ from greybox.estimation.result import Estimate
 from greybox.fleet.differing import SIGNIFICANCE, Comparison, compare_units, least_deviation
 from greybox.fleet.pooling import Pooled, pool
 from greybox.fleet.ships import LeftOut, ShipFiles, find_ships, require_ships
-from greybox.fleet.trend import FEWEST_PERIODS, Trend, fit_trend
+from greybox.fleet.trend import FEWEST_PERIODS, Trend, fit_trend, least_slope
 from greybox.model.terms import parameter_unit
 from greybox.notebook import DisplayMixin
 from greybox.numerics.parallel import map_pieces
@@ -255,6 +255,15 @@ class Fleet(DisplayMixin):
             f"{float(f'{reach:.2g}'):.0f} standard deviations before chance is "
             f"ruled out: a ship that is not named may still differ by less"
         )
+        lines = [t for t in self.trends if t is not None]
+        if lines:
+            fewest = min(lines, key=lambda t: len(t.times))
+            steep = least_slope(fewest.slope_df, len(lines) * len(self.names), SIGNIFICANCE)
+            told.append(
+                f"a line through {len(fewest.times)} periods must climb by about "
+                f"{float(f'{steep:.2g}'):.0f} of its standard errors before chance is ruled out: "
+                f"with more logs less is enough"
+            )
         return tuple(told)
 
     def rows(self) -> list[dict[str, Any]]:

@@ -5,7 +5,15 @@ The estimates of T periods are pooled about a line in time instead of a mean,
     y_t ~ N(θ_t, C_t),    θ_t ~ N(a + b τ_t, Ω),
 
 so that what differs from trial to trial without a trend, by weather, draught or what the model
-lacks, widens the interval of the slope b and is not taken for fouling.
+lacks, widens the interval of the slope b and is not taken for fouling. Where a model does not fit,
+estimates scatter by more than C says, and few periods hardly show by how much: the standard error
+of b is never less than what the scatter about the line makes it, and has the degrees of freedom of
+that scatter.
+
+References
+----------
+Knapp and Hartung (2003), Improved tests for a random effects meta-regression with a single
+covariate, Statist. Med. 22.
 """
 
 from __future__ import annotations
@@ -34,8 +42,10 @@ class Trend:
         (T,) of the periods.
     estimates, std : ndarray
         (T, p) of each period alone, and its standard errors.
-    slope, slope_std, slope_df : ndarray
-        (p,) change in one unit of time, its standard error, and degrees of freedom of that.
+    slope, slope_std : ndarray
+        (p,) change in one unit of time, and its standard error.
+    slope_df : int
+        Degrees of freedom of that, T − 2.
     line, line_std : ndarray
         (T, p) the line at the periods, and its standard errors, of the same degrees of freedom.
     """
@@ -45,7 +55,7 @@ class Trend:
     std: Array
     slope: Array
     slope_std: Array
-    slope_df: Array
+    slope_df: int
     line: Array
     line_std: Array
 
@@ -55,15 +65,30 @@ class Trend:
         return np.asarray(2 * student.sf(np.abs(self.slope) / self.slope_std, self.slope_df))
 
     @property
-    def reach(self) -> Array:
-        """Standard errors that the half of a 95 % interval is long, (p,)."""
-        return np.asarray(student.ppf((1 + LEVEL) / 2, self.slope_df))
+    def reach(self) -> float:
+        """Standard errors that the half of a 95 % interval is long."""
+        return float(student.ppf((1 + LEVEL) / 2, self.slope_df))
 
     @property
     def slope_interval(self) -> Array:
         """95 % interval of each slope, (p, 2)."""
         half = self.reach * self.slope_std
         return np.column_stack([self.slope - half, self.slope + half])
+
+
+def least_slope(freedom: int, lines: int, significance: float) -> float:
+    """Return by how many standard errors one of several lines must climb to be named.
+
+    Parameters
+    ----------
+    freedom : int
+        Degrees of freedom of its standard error.
+    lines : int
+        Coefficients that are followed, of all ships.
+    significance : float
+        Of any of them.
+    """
+    return float(student.isf(significance / (2 * lines), freedom))
 
 
 def fit_trend(times: Array, estimates: Array, covariances: Array) -> Trend:
@@ -96,13 +121,17 @@ def fit_trend(times: Array, estimates: Array, covariances: Array) -> Trend:
     pooled = pool(estimates, covariances, design)
     line = design @ pooled.beta
     line_covariance = design @ pooled.beta_covariance @ design.transpose(0, 2, 1)
+    own = np.diagonal(covariances, axis1=1, axis2=2)
+    freedom = len(times) - 2
+    scatter = ((estimates - line) ** 2 / (own + pooled.omega)).sum(axis=0) / freedom
+    wider = np.sqrt(np.maximum(scatter, 1.0))
     return Trend(
         times,
         estimates,
-        np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)),
+        np.sqrt(own),
         pooled.beta[size:] / unit,
-        pooled.beta_std[size:] / unit,
-        pooled.beta_df()[size:],
+        wider * pooled.beta_std[size:] / unit,
+        freedom,
         line,
-        np.sqrt(np.diagonal(line_covariance, axis1=1, axis2=2)),
+        wider * np.sqrt(np.diagonal(line_covariance, axis1=1, axis2=2)),
     )

@@ -76,7 +76,21 @@ def test_a_line_in_time_is_found_and_scatter_is_not():
     assert trend.slope_interval[0, 0] < 0.1 < trend.slope_interval[0, 1]
     assert trend.p_values[0] < 1e-4
     assert trend.p_values[1] > 0.05
-    assert 7 < trend.slope_df[1] < 9
+    assert trend.slope_df == 8
+
+
+@pytest.mark.parametrize("periods", [4, 8])
+def test_scatter_that_no_covariance_holds_is_no_change(periods):
+    """Of models that do not fit, estimates differ by more than their standard errors."""
+    rng = np.random.default_rng(periods)
+    runs, times = 300, np.arange(float(periods))
+    covariances = np.broadcast_to(0.01 * np.eye(2), (periods, 2, 2))
+    found = []
+    for _ in range(runs):
+        y = 0.1 * rng.choice([1.0, 4.0], (periods, 1)) * rng.standard_normal((periods, 2))
+        found.append(fit_trend(times, y, covariances).p_values)
+    share = np.mean(np.array(found) < 0.05)
+    assert share < 0.05 + 3 * np.sqrt(0.05 * 0.95 / (2 * runs))
 
 
 def test_the_verdict_names_ship_and_coefficient():
@@ -93,13 +107,14 @@ def test_the_verdict_names_ship_and_coefficient():
 
 
 def test_cautions_say_how_far_the_numbers_reach():
-    (reach,) = planted().cautions
+    reach, slope = planted().cautions
+    assert slope.startswith("a line through 8 periods must climb by about 7 of its standard")
     assert "among 6 ships one coefficient must deviate by about 13 standard deviations" in reach
     # as the manual has it
     known = [least_deviation(units, 18) for units in (5, 10, 20)]
     np.testing.assert_allclose(known, [20, 7, 5], rtol=0.03)
     # of three ships, one of which differs, two are left, between which there is no spread
-    assert "among 3 ships" in planted(3, odd=2000.0).cautions[-1]
+    assert any("among 3 ships" in c for c in planted(3, odd=2000.0).cautions)
     found = planted(3, 2)
     lost = replace(found.ships[0], fit={"u": -np.inf, "v": 3.0, "r": 4.0})
     fleet = replace(found, ships=(lost, *found.ships[1:]))
