@@ -77,7 +77,7 @@ def with_error(value: float, std: float) -> str:
         return number(value)
     last = int(np.floor(np.log10(std))) - 1
     if -7 <= last <= 0 and abs(value) < 1e6:
-        return f"{value:.{-last}f} ± {std:.{-last}f}"
+        return f"{value:z.{-last}f} ± {std:.{-last}f}"
     first = int(np.floor(np.log10(abs(value)))) if value else last + 1
     return f"{value:.{max(first - last, 0)}e} ± {std:.1e}"
 

@@ -44,7 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "raw",
         nargs="+",
         metavar="RAW",
-        help="raw files of one trial; where --out is a folder, each file is a trial",
+        help="raw files of one trial; where --out is a folder, each file is a trial; a folder "
+        "stands for the CSV and Parquet files in it",
     )
     parser.add_argument("--vessel", required=True, metavar="V", help=VESSEL_HELP)
     parser.add_argument(
@@ -142,7 +143,13 @@ def run(options: argparse.Namespace) -> None:
     from greybox.errors import UsageError, suggestion
     from greybox.files import check_targets, write_json
     from greybox.report.next_steps import after_import
-    from greybox.trial.import_files import LOG_SUFFIXES, import_files, is_folder, targets
+    from greybox.trial.import_files import (
+        LOG_SUFFIXES,
+        import_files,
+        is_folder,
+        raw_files,
+        targets,
+    )
     from greybox.trial.store import read_record, record_path
     from greybox.vessel.conditions import UNITS
     from greybox.vessel.toml import load_vessel
@@ -152,20 +159,21 @@ def run(options: argparse.Namespace) -> None:
             f"--fix-not names {', '.join(options.fix_not)}, and nothing is mended without --fix or "
             f"--fix-also: add one of them, or leave --fix-not out."
         )
-    folder = is_folder(options.raw, options.out)
+    raw = raw_files(options.raw)
+    folder = is_folder(raw, options.out)
     if not folder and Path(options.out).suffix.lower() not in ("", *LOG_SUFFIXES):
         raise UsageError(
             f"--out {options.out} ends in '{Path(options.out).suffix}': name a log that ends in "
             f".csv or .parquet."
         )
-    logs = targets(options.raw, options.out) if folder else [Path(options.out)]
+    logs = targets(raw, options.out) if folder else [Path(options.out)]
     if folder:
         check_targets(options.json)
     else:
         check_targets(options.out, record_path(options.out), options.json)
     vessel = load_vessel(options.vessel)
     summary = import_files(
-        options.raw,
+        raw,
         vessel,
         options.out,
         import_options(options),

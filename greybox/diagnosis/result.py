@@ -401,8 +401,9 @@ class Diagnosis(DisplayMixin):
             for c in causes:
                 lines.append(f"  {c.id}: {c.evidence}")
                 lines += [
-                    f"    {name:<22}{with_error(q.value, q.std):>24} {q.unit}"
+                    f"    {name:<22}{with_error(q.value, q.std):>24} {q.unit}".removesuffix(" 1")
                     for name, q in c.parameters.items()
+                    if q.std > 0
                 ]
                 lines.append(
                     f"    adjusted p {_shown(c.p_adjusted)} ({self.tried} causes tried); {c.proved}"

@@ -331,8 +331,10 @@ class LargeError(Reason):
         if self.error >= 1:
             when = f"after {self.horizon:.3g} s" if self.horizon > 0 else "from the start"
             return f"{who} is worse than a constant {when}"
+        # what is above a limit must not be rounded to it
+        digits = 0 if round(100 * self.error) > round(100 * self.limit) else 1
         return (
-            f"the error of {who} is {100 * self.error:.0f} % of its spread "
+            f"the error of {who} is {100 * self.error:.{digits}f} % of its spread "
             f"({100 * self.limit:.0f} % is allowed)"
         )
 

@@ -120,8 +120,8 @@ def estimate_inertia(
     zero = [n for n, g in gains.items() if g == 0.0]
     if zero:
         raise StructureError(
-            f"the inertias need the input gains Xmu, Ymu and Nmu, and {zero[0]} is "
-            f"{gains[zero[0]]:g}: estimate it first."
+            f"the inertias follow from the input gains Xmu, Ymu and Nmu, and {zero[0]} is "
+            f"{gains[zero[0]]:g}: the thrusters' own forces show no inertia in that direction."
         )
     surge = sample_time / gains["Xmu"] if thrust_in_newtons else mass * (1 + surge_added_mass)
     return Inertia(surge, surge * gains["Xmu"] / gains["Ymu"], surge * gains["Xmu"] / gains["Nmu"])

@@ -42,12 +42,12 @@ class Extrapolation:
             self.signal, " deg" if self.angle else ""
         )
         (least, most), (low, high) = self.run, self.known
-        spread = f"is {least * factor:.3g}{unit}"
+        spread = f"is {least * factor:z.3g}{unit}"
         if most > least:
-            spread = f"goes from {least * factor:.3g} to {most * factor:.3g}{unit}"
+            spread = f"goes from {least * factor:z.3g} to {most * factor:z.3g}{unit}"
         return (
             f"extrapolated: {_NAMES.get(self.signal, self.signal)} {spread}, and the model was "
-            f"estimated on {low * factor:.3g} to {high * factor:.3g}{unit}."
+            f"estimated on {low * factor:z.3g} to {high * factor:z.3g}{unit}."
         )
 
 

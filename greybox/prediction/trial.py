@@ -279,8 +279,8 @@ class TrialCurrent:
         error = math.sqrt(float(((self.value / speed) ** 2 * self.std**2).sum()))
         towards = math.degrees(math.atan2(self.value[1], self.value[0])) % 360
         return (
-            f"sailed in the current of the trial, {speed:.2g} ± {1.96 * error:.1g} m/s towards "
-            f"{towards:.0f} deg, by which its turning circle drifts."
+            f"sailed in the current of the trial, {speed:.2g} ± {error:.2g} m/s (± one "
+            f"standard error) towards {towards:.0f} deg, by which its turning circle drifts."
         )
 
 

@@ -295,9 +295,9 @@ def _parameter_table(estimate: EstimateValues) -> Table:
     sets = weak_safe_sets(estimate.tests)
     rows = []
     for name, unit, value, error in zip(labels, units, theta, std, strict=True):
+        known = f"{value - 1.96 * error:.4g} to {value + 1.96 * error:.4g}"
         row = [
-            name, f"{value:.4g}", f"{error:.2g}",
-            f"{value - 1.96 * error:.4g} to {value + 1.96 * error:.4g}",
+            name, f"{value:.4g}", *((f"{error:.2g}", known) if error > 0 else ("at bound", "–")),
             *([set_in_words(sets.get(name))] if sets else []),
             f"{value / estimate.sample_time:.4g}", unit,
             "not to rely on" if name in estimate.verdict.excepted else "",

@@ -252,7 +252,7 @@ def _trend_figure(ship: ShipEstimate, trend: Trend, j: int, name: str, unit: str
     axes = figure.subplots()
     # years count from 1970 in the times
     times = trend.times + (1970 if ship.dated else 0)
-    half = trend.reach[j] * trend.line_std[:, j]
+    half = trend.reach * trend.line_std[:, j]
     line = trend.line[:, j]
     axes.fill_between(times, line - half, line + half, color=BLUE, alpha=0.2, linewidth=0)
     axes.plot(times, line, color=BLUE, linewidth=1.3, label="line")

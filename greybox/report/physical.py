@@ -32,8 +32,8 @@ def physical_summary(model: ManoeuvringModel, mass: float, speed: float | None =
     except StructureError as error:
         return f"Physical quantities: not available, because {error}"
     length = model.vessel.length
-    if speed is None:
-        speed = (9.81 * length) ** 0.5 / 4
+    usual = " of a usual Froude number, 0.25" if speed is None else ""
+    speed = (9.81 * length) ** 0.5 / 4 if speed is None else speed
     coefficients = to_continuous(theta, model.structure, model.sample_time, inertia)
     primes = to_prime(coefficients, model.structure, length=length, speed=speed)
     how = (
@@ -46,7 +46,7 @@ def physical_summary(model: ManoeuvringModel, mass: float, speed: float | None =
         f"  m − X_u̇ = {inertia.surge:.4g} kg, m − Y_v̇ = {inertia.sway:.4g} kg, "
         f"I_z − N_ṙ = {inertia.yaw:.4g} kg m²",
         f"  {'coefficient':<14}{'value':>13}{'prime':>13}   (SI; prime with L = {length:g} m, "
-        f"U = {speed:.2f} m/s)",
+        f"U = {speed:.2f} m/s{usual})",
     ]
     for name, value in coefficients.items():
         prime = f"{primes[name]:>13.4g}" if name in primes else f"{'':>13}"

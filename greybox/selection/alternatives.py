@@ -145,11 +145,15 @@ def _plausible(
     if turned >= ADVISED_HEADING and rows >= most:
         kinds = ["wind", "augmented", *kinds] if measured else ["augmented", *kinds]
     else:
-        notes.append(
-            f"bias-capturing terms were left out: heading covers {np.degrees(turned):.0f} deg "
-            f"(about {np.degrees(ADVISED_HEADING):.0f} are needed) on {rows} samples "
-            f"(about {most})."
-        )
+        lacking = []
+        if turned < ADVISED_HEADING:
+            lacking.append(
+                f"the heading covers {np.degrees(turned):.0f} deg, and about "
+                f"{np.degrees(ADVISED_HEADING):.0f} are needed"
+            )
+        if rows < most:
+            lacking.append(f"there are {rows} samples, and about {most} are needed")
+        notes.append(f"bias-capturing terms were left out: {'; '.join(lacking)}.")
     return kinds
 
 

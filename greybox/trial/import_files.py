@@ -22,14 +22,30 @@ from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.two_pass_import import Stream, is_large
 from greybox.trial.log import Provenance, TrialLog
+from greybox.trial.log_files import find_logs
 from greybox.trial.raw_log import Recording
-from greybox.trial.readers.formats import open_raw
+from greybox.trial.readers.formats import is_bag, open_raw
 from greybox.trial.repair import check_ids, repair
 from greybox.trial.store import record_path, write_log
 from greybox.vessel.vessel import Vessel
 
 # a log has one of these names; any other is a folder where several files are imported
 LOG_SUFFIXES = (".csv", ".parquet", ".pq")
+
+
+def raw_files(paths: Sequence[str]) -> list[str]:
+    """Return the raw files that paths stand for: of a folder its logs, where it is no bag.
+
+    Raises
+    ------
+    LogError
+        A folder holds no CSV or Parquet file.
+    """
+    files: list[str] = []
+    for path in paths:
+        logs = Path(path).is_dir() and not is_bag(Path(path))
+        files += [f.path for f in find_logs([path])] if logs else [path]
+    return files
 
 
 def import_files(

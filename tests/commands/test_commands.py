@@ -306,6 +306,19 @@ def test_what_is_told_to_do_next_can_be_typed_as_it_stands(tmp_path, capsys, mon
     assert Path("check.html").exists()
 
 
+def test_a_folder_of_raw_files_is_mended_as_it_was_checked(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("raw").mkdir()
+    for seed in (2, 3):
+        log = virtual_log(seed, 300)
+        write_csv(log, Path(f"raw/day{seed}.csv"), psi=np.degrees(log["psi"]))
+    assert run("check", "raw", "--vessel", "thesis") == 0
+    told = capsys.readouterr().out.splitlines()
+    step = next(s for s in told if s.startswith("next: ") and "--fix" in s)
+    assert run(*shlex.split(step.split(": ")[-1])[1:]) == 0
+    assert sorted(p.name for p in Path("mended").glob("*.csv")) == ["day2.csv", "day3.csv"]
+
+
 def test_an_error_about_a_raw_file_tells_the_whole_command(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("my raw.csv").write_text("Time UTC,RPM\n0,1\n1,1\n")

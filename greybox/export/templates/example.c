@@ -5,7 +5,7 @@
  *
  * The numbers are the start: {{ start_names }}. The log is CSV with a header and one row every
  * {{ sample_time }} s; columns are found by name: {{ input_names }}.
- * Cells are numbers without quotes, as greybox import writes them.
+ * Names may stand in quotes, as greybox import writes them; numbers may not.
  */
 #include "{{ header }}"
 
@@ -27,11 +27,17 @@ static int cells(char *text, char *cell[])
     int n = 0;
     text[strcspn(text, "\r\n")] = 0;
     while (n < MOST_COLUMNS) {
-        char *comma = strchr(text, ',');
+        char *comma = strchr(text, ','), *last;
+        if (comma)
+            *comma = 0;
+        last = text + strlen(text) - 1;
+        if (last > text && *text == '"' && *last == '"') {
+            text++;
+            *last = 0;
+        }
         cell[n++] = text;
         if (!comma)
             break;
-        *comma = 0;
         text = comma + 1;
     }
     return n;

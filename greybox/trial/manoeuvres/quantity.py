@@ -57,10 +57,10 @@ class Quantity:
         unit, factor = _SHOWN.get(self.unit, (self.unit, 1.0))
         low, high = (b * factor for b in self.interval)
         digits = _decimals(high - low, abs(self.value * factor))
-        shown = f"{self.value * factor:.{digits}f} {unit}".rstrip()
+        shown = f"{self.value * factor:z.{digits}f} {unit}".rstrip()
         if length is not None and self.unit == "m":
             shown = f"{self.value / length:.2f} L = {shown}"
-        return shown, f"{low:.{digits}f} to {high:.{digits}f}"
+        return shown, f"{low:z.{digits}f} to {high:z.{digits}f}"
 
 
 def _decimals(width: float, size: float) -> int:

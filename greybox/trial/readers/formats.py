@@ -119,6 +119,11 @@ def _reader(kind: str, path: Path) -> Callable[..., Any]:
     return cast(Callable[..., Any], getattr(found, function))
 
 
+def is_bag(folder: Path) -> bool:
+    """Whether a folder is a bag of ROS 2."""
+    return (folder / "metadata.yaml").exists()
+
+
 def _kind(path: Path) -> str:
     try:
         there = path.exists()
@@ -128,7 +133,7 @@ def _kind(path: Path) -> str:
     if not there:
         raise LogError(f"there is no file '{path}'.{nearest_file(path)} Name an existing log.")
     if path.is_dir():
-        if (path / "metadata.yaml").exists():
+        if is_bag(path):
             return "ros"
         raise LogError(f"'{path}' is a folder without a ROS 2 bag: name the files in it.")
     if not stat.S_ISREG(os.stat(path).st_mode):
