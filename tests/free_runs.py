@@ -189,7 +189,9 @@ def run_program(
 ) -> dict[str, np.ndarray]:
     """Run the example on columns from a start and return its columns."""
     rows = zip(*columns.values(), strict=True)
-    text = "\n".join([",".join(columns), *[",".join(f"{v:.17g}" for v in row) for row in rows]])
+    # names in quotes, as logs are written
+    head = ",".join(f'"{name}"' for name in columns)
+    text = "\n".join([head, *[",".join(f"{v:.17g}" for v in row) for row in rows]])
     done = subprocess.run(
         [program, *[f"{v:.17g}" for v in start]], input=text, check=True, capture_output=True,
         text=True,
