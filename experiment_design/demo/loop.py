@@ -15,6 +15,7 @@ from experiment_design.output.result import Design, write_plan
 from experiment_design.prepare import prepare_request
 from experiment_design.request.request import DesignRequest
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
+from greybox.diagnosis.gain import gains
 from greybox.diagnosis.result import Diagnosis, Found
 from greybox.errors import UsageError, suggestion
 from greybox.estimation.result import Estimate
@@ -140,7 +141,7 @@ def run_demo(
 
     better = load_model(files.better)
     after = _run_on(files.other, {"model": model, "better": better})
-    done(_gained(diagnosis))
+    done(_gained(after, better.sample_time, seed))
 
     progress("designing the next trial")
     asked = _asked(_NEXT_SECONDS, seed, prior=better)
@@ -287,11 +288,12 @@ def _diagnosed(diagnosis: Diagnosis, hidden: Sequence[Effect]) -> Step:
     )
 
 
-def _gained(diagnosis: Diagnosis) -> Step:
+def _gained(compared: Comparison, sample_time: float, seed: int) -> Step:
+    before, after = compared.runs
     told = [
         f"{_NAMES[s]} from {g.before:.1f} to {g.after:.1f} % (95 % interval of the gain "
         f"{g.ci[0]:.1f} to {g.ci[1]:.1f})"
-        for s, g in diagnosis.gain.items()
+        for s, g in gains(before, after, sample_time, seed).items()
         if s in _NAMES
     ]
     return Step(
