@@ -11,7 +11,7 @@ import pytest
 
 FOLDER = Path(__file__).parents[1] / "examples"
 # within seconds; the others take up to half a minute
-QUICK = {"add_a_term", "import_and_check", "predict_precision"}
+QUICK = {"add_a_term", "predict_precision"}
 SECONDS = 600
 # every step of the loop, and all of it
 STEPS = {

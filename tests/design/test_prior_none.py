@@ -49,8 +49,8 @@ def require_plan(plan, name, said, notes, *parts):
     ("name", "duration", "hold"),
     [
         ("kvlcc2-320m", "250", "50"),
-        ("kvlcc2-7m", "60", "20"),
-        ("training-ship-105m", "150", "50"),
+        pytest.param("kvlcc2-7m", "60", "20", marks=pytest.mark.long),
+        pytest.param("training-ship-105m", "150", "50", marks=pytest.mark.long),
         ("research-catamaran-29m", "60", "20"),
     ],
 )

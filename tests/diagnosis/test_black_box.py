@@ -61,6 +61,7 @@ def missed(model, log) -> np.ndarray:
     return np.array([((log[s] - run.x[:, i]) ** 2).mean() for i, s in enumerate(run.fit)])
 
 
+@pytest.mark.long
 def test_held_out_errors_fall(fitted, trial) -> None:
     before, after, *_ = fitted
     one, two = missed(before, trial.validation), missed(after, trial.validation)
@@ -68,6 +69,7 @@ def test_held_out_errors_fall(fitted, trial) -> None:
     assert np.log(two / one).mean() < np.log(0.75)
 
 
+@pytest.mark.long
 def test_nothing_else_of_the_model_moves(fitted) -> None:
     before, after, terms, _ = fitted
     p = len(before.theta)
@@ -77,6 +79,7 @@ def test_nothing_else_of_the_model_moves(fitted) -> None:
     assert set(after.names[p:]) <= {t.name for t in terms}
 
 
+@pytest.mark.long
 def test_away_from_the_logs_the_run_is_that_without_it(fitted, trial) -> None:
     before, after, *_ = fitted
     log = trial.validation
@@ -91,6 +94,7 @@ def test_away_from_the_logs_the_run_is_that_without_it(fitted, trial) -> None:
     np.testing.assert_array_equal(one[:beyond], two[:beyond])
 
 
+@pytest.mark.long
 def test_its_covariance_is_one(fitted) -> None:
     _, after, _, made = fitted
     joint = joint_covariance(after)
@@ -102,6 +106,7 @@ def test_its_covariance_is_one(fitted) -> None:
     assert (after.std[p:] > 0).all()
 
 
+@pytest.mark.long
 def test_the_fit_repeats_the_models_run(fitted, trial) -> None:
     _, after, _, made = fitted
     run, start = made.problem.runs[0], made.fit.point.starts[0]
@@ -110,6 +115,7 @@ def test_the_fit_repeats_the_models_run(fitted, trial) -> None:
     np.testing.assert_allclose(run_on(after, log).x, x, atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler 'cc'")
 def test_a_c_program_repeats_the_run(fitted, trial, tmp_path) -> None:
     _, after, *_ = fitted

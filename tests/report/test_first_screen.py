@@ -60,6 +60,12 @@ def plan(model):
     return random_plan(model, load_vessel("thesis"), duration=120.0)
 
 
+@pytest.fixture(scope="module")
+def story(plan, logs, estimate, tmp_path_factory):
+    """The page of the demo."""
+    return demo_page(demo_of(tmp_path_factory.mktemp("demo"), plan, logs[0], estimate), {})
+
+
 def demo_of(folder, plan, log, estimate):
     before, after = (
         compare(dict.fromkeys(names, estimate.model()), log)
@@ -100,7 +106,7 @@ def written(request, tmp_path, logs, estimate, model, plan):
             planted(12, odd=30.0, change=0.03, left_out=[("ship 13", "its folder has no logs.")]),
             {"command": {"fleet": "ferries"}},
         ),
-        "demo": lambda: demo_page(demo_of(tmp_path, plan, logs[0], estimate), record),
+        "demo": lambda: request.getfixturevalue("story"),
     }[request.param]
     write_page(make(), path)
     return path
@@ -134,7 +140,6 @@ def test_the_first_screen(written):
         assert [e["message"] for e in browser.get_log("browser")] == []
 
 
-def test_the_demo_tells_how_much_of_what_is_left_is_noise(tmp_path, plan, logs, estimate):
-    page = demo_page(demo_of(tmp_path, plan, logs[0], estimate), {})
-    assert "that is left: surge 33 %" in " ".join(page.sentences)
-    assert "Fit of the free run before and after" in page.lead.caption
+def test_the_demo_tells_how_much_of_what_is_left_is_noise(story):
+    assert "that is left: surge 33 %" in " ".join(story.sentences)
+    assert "Fit of the free run before and after" in story.lead.caption
