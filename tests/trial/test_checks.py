@@ -208,6 +208,34 @@ def test_without_a_velocity_sensor_a_bias_cannot_be_told(ship):
     assert "no velocity sensor of its own" in said["heading_bias"].sentence
 
 
+@pytest.mark.parametrize(
+    ("name", "wide", "found"),
+    [
+        ("rate reversed", False, ("sign", "r", True)),
+        ("rate reversed", True, ("sign", "r", True)),
+        ("heading anticlockwise", True, ("sign", "psi", True)),
+        ("heading from east", True, ("frame", "psi", True)),
+        # azimuths that always push to starboard: the course lies 32 deg off the bow
+        ("heading anticlockwise", False, ("sign", "psi", False)),
+        ("heading from east", False, ("frame", "psi", False)),
+    ],
+)
+def test_without_a_velocity_sensor_the_course_tells_heading_from_rate(name, wide, found, ship):
+    plant, _, _ = PLANTED[name]
+    d = {n: v for n, v in recorded(0, 2.0, seconds=300.0, wide=wide).items() if n not in ("u", "v")}
+    (finding,) = check_recording(as_recording(plant(d)), ship).findings
+    assert (finding.id, finding.channel, finding.safe) == found
+
+
+def test_without_a_course_heading_and_rate_are_both_in_doubt(ship):
+    d = negate(recorded(0, 2.0, seconds=300.0, wide=True), "r")
+    d = {n: v for n, v in d.items() if n in ("t", "psi", "r")}
+    (finding,) = check_recording(as_recording(d), ship).findings
+    assert (finding.id, finding.channel, finding.safe) == ("sign", "r", False)
+    assert "psi is reversed would explain as much" in finding.evidence
+    assert "--fix-also sign" in finding.fix
+
+
 @pytest.mark.parametrize(("turned", "side"), [(0.6, "34 deg to port"), (-0.6, "34 deg to star")])
 def test_the_side_on_which_the_course_lies_needs_no_sign(turned, side):
     t = np.arange(600.0)

@@ -10,7 +10,7 @@ from pathlib import Path
 from greybox.errors import LogError, UsageError
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.checks.actuators import measure_actuators
-from greybox.trial.checks.course import course_findings
+from greybox.trial.checks.course import course_findings, make_course
 from greybox.trial.checks.external_force import force_findings
 from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome
 from greybox.trial.checks.frame_sign_unit import (
@@ -232,7 +232,8 @@ def _read_columns(logs: Sequence[_Log]) -> list[Motion | None]:
     for log in logs:
         log.say(frame_outcomes(log.motion))
     usable = [i for i, m in enumerate(motions) if m is not None and (m.positioned or m.turned)]
-    readings = find_readings([m for i in usable if (m := motions[i]) is not None])
+    courses = [make_course(logs[i].mended) for i in usable]
+    readings = find_readings([m for i in usable if (m := motions[i]) is not None], courses)
     names = [logs[i].recorded.name for i in usable]
     for i, reading in zip(usable, readings, strict=True):
         logs[i].add(reading_findings(reading, names))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,12 +17,83 @@ from greybox.vessel.vessel import Vessel
 Array = NDArray[np.float64]
 
 # a hull that goes ahead drifts by less than this; thrusters that push sideways may do more
-_PLAUSIBLE = np.radians(20)
+PLAUSIBLE = np.radians(20)
 _LEAST_TURN = np.radians(20)
 _LEAST_SHARE = 0.95
 _WINDOW = 2.0
 # parts of a log that are left out in turn for the error (jackknife)
 _BLOCKS = 12
+# samples under way, and the speed that is way [m/s]
+_LEAST_SAMPLES = 50
+_LEAST_SPEED = 0.2
+
+
+@dataclass(frozen=True)
+class Course:
+    """Heading and velocity over ground while a vessel makes way.
+
+    Parameters
+    ----------
+    t : ndarray
+        (N,) [s].
+    psi : ndarray
+        (N,) as logged [rad].
+    turning : ndarray
+        (N,) rate of `psi` [rad/s].
+    track : ndarray
+        (N,) velocity, north + i east [m/s].
+    """
+
+    t: Array
+    psi: Array
+    turning: Array
+    track: NDArray[np.complex128]
+
+    def drift(self, psi: Array) -> NDArray[np.complex128]:
+        """Return the direction of the way against a bow that points to `psi`, each of length 1."""
+        return np.asarray(self.track / np.abs(self.track) * np.exp(-1j * psi))
+
+
+def make_course(recording: Recording) -> Course | None:
+    """Return the course of a recording, None without positions (or their rates) and heading."""
+    names = ("v_n", "v_e", "psi") if "v_n" in recording else ("x_n", "y_n", "psi")
+    motion = make_motion(recording, names)
+    if motion is None or not all(n in motion for n in names):
+        return None
+    velocity = _velocity(motion.t, motion[names[0]], motion[names[1]], motion.step, names[0])
+    speed = np.hypot(*velocity.T)
+    quick = float(np.quantile(speed, 0.9))
+    rows = np.flatnonzero(speed > 0.5 * quick)
+    if len(rows) < _LEAST_SAMPLES or quick < _LEAST_SPEED:
+        rows = rows[:0]
+    psi = motion["psi"]
+    turning = np.gradient(smooth(psi, motion, _WINDOW / 2), motion.step)
+    track = velocity[rows, 0] + 1j * velocity[rows, 1]
+    return Course(motion.t[rows], psi[rows], turning[rows], track)
+
+
+def course_scatter(
+    courses: Sequence[Course], read: Callable[[Array], Array]
+) -> tuple[float, float]:
+    """Return how the courses of several logs lie to their headings.
+
+    Parameters
+    ----------
+    courses : sequence of Course
+    read : callable
+        ψ as logged -> ψ as it may be meant [rad].
+
+    Returns
+    -------
+    tuple of float
+        Circular variance within the logs, 0 where the course keeps its angle to the bow and 1
+        where it goes anywhere; and the mean angle, from the bow to starboard [rad].
+    """
+    sums = [complex(c.drift(read(c.psi)).sum()) for c in courses]
+    count = sum(len(c.psi) for c in courses)
+    if not count:
+        return 1.0, 0.0
+    return 1.0 - sum(map(abs, sums)) / count, float(np.angle(sum(sums)))
 
 
 def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding], list[Outcome]]:
@@ -35,49 +109,41 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
         Canonical, with positions or velocities over ground, and heading.
     vessel : Vessel
     """
-    names = ("v_n", "v_e", "psi") if "v_n" in recording else ("x_n", "y_n", "psi")
     vague = "the log has no velocity sensor of its own, only course and heading"
-    motion = make_motion(recording, names)
-    if motion is None or not all(n in motion for n in names):
+    course = make_course(recording)
+    if course is None:
         return [], [Outcome("heading_bias", "cannot tell", "needs positions and heading")]
-    velocity = _velocity(motion.t, motion[names[0]], motion[names[1]], motion.step, names[0])
-    speed = np.hypot(*velocity.T)
-    under_way = speed > 0.5 * np.quantile(speed, 0.9)
-    if under_way.sum() < 50 or np.quantile(speed, 0.9) < 0.2:
+    psi, track = course.psi, course.track
+    if not len(psi):
         return [], [Outcome("heading_bias", "cannot tell", f"{vague}, and it hardly moves")]
-    psi = motion["psi"]
-    track = velocity[:, 0] + 1j * velocity[:, 1]
-    drift = (track * np.exp(-1j * psi))[under_way]
-    unit = drift / np.abs(drift)
+    unit = course.drift(psi)
     mean = complex(unit.mean())
     angle = float(np.angle(mean))
-    spread = float(np.ptp(psi[under_way]))
+    spread = float(np.ptp(psi))
     sentence = f"{vague}: a bias cannot be told from a drift angle of {np.degrees(angle):.0f} deg"
-    astern = abs(abs(angle) - np.pi) < _PLAUSIBLE
-    if abs(mean) < _LEAST_SHARE or abs(angle) < _PLAUSIBLE or astern or spread < _LEAST_TURN:
+    astern = abs(abs(angle) - np.pi) < PLAUSIBLE
+    if abs(mean) < _LEAST_SHARE or abs(angle) < PLAUSIBLE or astern or spread < _LEAST_TURN:
         return [], [Outcome("heading_bias", "cannot tell", sentence)]
     if _pushed(recording, vessel, angle):
         return [], [
             Outcome("heading_bias", "cannot tell", f"{sentence}, and the thrusters push that way")
         ]
     # a current beside the body-fixed direction, and the drift of a turning hull: all are fitted
-    rows = np.flatnonzero(under_way)
-    bow = np.exp(1j * psi[rows])
-    turning = np.gradient(smooth(psi, motion, _WINDOW / 2), motion.step)[rows]
-    design = np.column_stack([bow, np.ones(len(rows)), 1j * turning * bow])
-    bias = _bias(design, track[rows])
-    blocks = np.array_split(np.arange(len(rows)), _BLOCKS)
-    left = [_bias(np.delete(design, b, axis=0), np.delete(track[rows], b)) for b in blocks]
+    bow = np.exp(1j * psi)
+    design = np.column_stack([bow, np.ones(len(psi)), 1j * course.turning * bow])
+    bias = _bias(design, track)
+    blocks = np.array_split(np.arange(len(psi)), _BLOCKS)
+    left = [_bias(np.delete(design, b, axis=0), np.delete(track, b)) for b in blocks]
     apart = np.angle(np.exp(1j * (np.array(left) - bias)))
     error = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum((apart - apart.mean()) ** 2)))
-    if abs(bias) - 1.96 * error < _PLAUSIBLE:
+    if abs(bias) - 1.96 * error < PLAUSIBLE:
         told = (
             f"{vague}: beside a current and the drift of turning, the course lies "
             f"{np.degrees(-bias):.0f} +/- {np.degrees(1.96 * error):.0f} deg off the heading"
         )
         return [], [Outcome("heading_bias", "cannot tell", told)]
     # what a drifting hull may add is unknown: the interval allows for a plausible drift angle
-    half = float(np.hypot(1.96 * error, _PLAUSIBLE / 2))
+    half = float(np.hypot(1.96 * error, PLAUSIBLE / 2))
     finding = Finding(
         "heading_bias",
         "psi",
@@ -93,7 +159,7 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
         ("psi",),
         (mend("turn_heading", ("psi",), angle=bias),),
         False,
-        {"t": motion.t[rows], "drift": np.angle(drift)},
+        {"t": course.t, "drift": np.angle(unit)},
     )
     return [finding], []
 

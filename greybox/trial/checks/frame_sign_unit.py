@@ -2,7 +2,8 @@
 
 Each alternative is a small change to how columns are read. All are compared by
 the likelihood of positions against velocities and of heading against yaw rate;
-the fewest changes win unless the gain is beyond doubt.
+the fewest changes win unless the gain is beyond doubt. Where no velocities tie the
+heading to positions, the course over ground tells whether heading or yaw rate is reversed.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.rotation import ned_to_body
+from greybox.trial.checks.course import PLAUSIBLE, Course, course_scatter
 from greybox.trial.checks.finding import Finding, Outcome, declare_unit
 from greybox.trial.checks.motion import Motion, integrate, profiles, to_ned
+from greybox.trial.checks.wind_convention import STEADIER
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.steps import Step, mend
 from greybox.units import UNITS
@@ -183,6 +186,8 @@ _ACROSS = (
 
 
 _CHANGES = (*_PSI, *_RATE, *_VELOCITY, *_POSITION, *_ACROSS)
+# heading and yaw rate by themselves agree alike under each of these
+_REVERSED_RATE, _REVERSED_HEADING, _HEADING_FROM_EAST = _SENSES = (_RATE[0], _PSI[0], _PSI[1])
 
 
 @dataclass(frozen=True)
@@ -200,7 +205,10 @@ class ColumnReading:
     logs : tuple of int
         Which logs are read so together.
     sure : bool
-        Whether this log follows logs that agree, or tells by itself.
+        Whether this log follows logs that agree, or tells by itself, and no other reading
+        explains as much.
+    remark : str
+        What else speaks for the reading, or leaves it in doubt.
     """
 
     changes: tuple[ColumnHypothesis, ...]
@@ -208,15 +216,20 @@ class ColumnReading:
     gain: float
     logs: tuple[int, ...] = (0,)
     sure: bool = True
+    remark: str = ""
 
 
-def find_readings(motions: Sequence[Motion]) -> list[ColumnReading]:
+def find_readings(
+    motions: Sequence[Motion], courses: Sequence[Course | None] = ()
+) -> list[ColumnReading]:
     """Choose among the readings of the columns, of all logs of one ship together.
 
     Parameters
     ----------
     motions : sequence of Motion
         As named.
+    courses : sequence of Course, optional
+        Of the same logs, as named; None where a log has none.
 
     Returns
     -------
@@ -236,22 +249,86 @@ def find_readings(motions: Sequence[Motion]) -> list[ColumnReading]:
             break
         apart += against
         together = [i for i in together if i not in against]
-    chosen = {i: (shared, tuple(together)) for i in together}
-    chosen |= {i: (_decide([logs[i]]), (i,)) for i in apart}
-    return [_reading(i, motions[i], logs, *chosen[i], bool(apart)) for i in range(len(logs))]
+    groups = [(shared, tuple(together))] if together else []
+    groups += [(_decide([logs[i]]), (i,)) for i in apart]
+    readings: dict[int, ColumnReading] = {}
+    for key, group in groups:
+        known = [c for i in group if i < len(courses) and (c := courses[i]) is not None]
+        settled = _settle([logs[i] for i in group], known, key)
+        for i in group:
+            readings[i] = _reading(i, motions[i], logs, settled, group, bool(apart))
+    return [readings[i] for i in range(len(logs))]
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """A reading, whether it is the only one that explains so much, and what tells that."""
+
+    key: Key
+    sure: bool = True
+    remark: str = ""
+
+
+def _settle(logs: Sequence[_Alternatives], courses: Sequence[Course], key: Key) -> _Settled:
+    """Choose among the readings that heading and yaw rate alone cannot tell from `key`.
+
+    The course over ground turns with the true heading, and a hull that goes ahead keeps it near
+    the bow. What neither tells is left at the fewest changes: nothing is derived from the yaw rate.
+    """
+    changes = _changes(logs, key)
+    if any(log.motion.positioned for log in logs) or not any(c in _SENSES for c in changes):
+        return _Settled(key)
+    rest = tuple(c for c in changes if c not in _SENSES)
+
+    def scatter(*more: ColumnHypothesis) -> tuple[float, float]:
+        turned = [c for c in (*rest, *more) if c.channels == ("psi",)]
+
+        def heading(psi: Array) -> Array:
+            for c in turned:
+                psi = c.apply({"psi": psi})["psi"]
+            return psi
+
+        return course_scatter(courses, heading)
+
+    (as_named, _), (against, angle) = scatter(), scatter(_REVERSED_HEADING)
+    east = scatter(_HEADING_FROM_EAST)[1]
+    change, sure, remark = _REVERSED_RATE, True, "; the course turns with psi as it is"
+    if against * STEADIER < as_named:
+        off, other = abs(angle), _HEADING_FROM_EAST
+        change = _REVERSED_HEADING
+        if abs(east) < off:
+            off, change, other = abs(east), other, change
+        sure = bool(off < PLAUSIBLE)
+        remark = "; the course turns against psi as it is"
+        if not sure:
+            remark += f", {np.degrees(off):.0f} deg off the bow so read: perhaps {other.words}"
+    elif as_named * STEADIER >= against:
+        sure = False
+        remark = (
+            f"; that {_REVERSED_HEADING.words} would explain as much, and no course tells which"
+        )
+    words = {*_words(rest), change.words}
+    for log in logs:
+        for found in log.ranked:
+            if set(found) == words:
+                return _Settled(found, sure, remark)
+    return _Settled(key, False, remark)
 
 
 def _reading(
-    i: int, motion: Motion, logs: Sequence[_Alternatives], key: Key, together: tuple[int, ...],
-    divided: bool,
+    i: int, motion: Motion, logs: Sequence[_Alternatives], settled: _Settled,
+    together: tuple[int, ...], divided: bool,
 ) -> ColumnReading:  # fmt: skip
-    mine = logs[i]
+    mine, key = logs[i], settled.key
     changes = tuple(c for c in _changes([logs[k] for k in together], key) if mine.applies(c))
     if not changes:
         return ColumnReading((), motion, 0.0, together)
     gain = sum(logs[k].beside(key) for k in together)
-    sure = not divided or mine.beside(key) >= _LEAST_GAIN * mine.sample_correlation_factor
-    return ColumnReading(changes, read(motion, changes), gain, together, sure)
+    sure, remark = settled.sure, settled.remark
+    if divided and mine.beside(key) < _LEAST_GAIN * mine.sample_correlation_factor:
+        sure = False
+        remark += "; other logs of the ship are as named, and this one cannot tell by itself"
+    return ColumnReading(changes, read(motion, changes), gain, together, sure, remark)
 
 
 def _decide(logs: Sequence[_Alternatives]) -> Key:
@@ -331,8 +408,6 @@ def reading_findings(reading: ColumnReading, names: Sequence[str] = ()) -> list[
             else "heading and the other channels"
         )
         beside = f" in {len(reading.logs)} logs together" if several else ""
-        doubt = "" if reading.sure else "; other logs of the ship are as named, and this one "
-        doubt += "" if reading.sure else "cannot tell by itself"
         found.append(
             Finding(
                 c.id,
@@ -341,8 +416,8 @@ def reading_findings(reading: ColumnReading, names: Sequence[str] = ()) -> list[
                 (c.value, c.value),
                 c.unit,
                 f"{c.words}: only then do {tied} agree (log-likelihood higher by "
-                f"{reading.gain:.0f}{beside}){doubt}",
-                c.fix,
+                f"{reading.gain:.0f}{beside}){reading.remark}",
+                c.fix if reading.sure else c.fix.replace("--fix", f"--fix-also {c.id}", 1),
                 c.channels,
                 c.repair,
                 reading.sure,

@@ -15,8 +15,8 @@ from greybox.trial.steps import Step, mend
 
 Array = NDArray[np.float64]
 
-# the true wind must become this much steadier under another convention
-_RATIO = 3.0
+# what does not turn with the ship must become this much steadier under another convention
+STEADIER = 3.0
 _LEAST_TURN = np.radians(60)
 _BLOCK_SECONDS = 20.0
 
@@ -102,7 +102,7 @@ def wind_findings(recording: Recording, findings: list[Finding]) -> list[Finding
     as_named = scatter(u_q + 1j * v_q)
     best, k = min((scatter(c.meant(u_q, v_q, psi)), k) for k, c in enumerate(_CONVENTIONS))
     blocks = max(int(np.ptp(motion.t) / _BLOCK_SECONDS), 1)
-    if best * _RATIO > as_named or blocks < 5:
+    if best * STEADIER > as_named or blocks < 5:
         return []
     convention = _CONVENTIONS[k]
     through = convention.meant(u_q, v_q, psi)
