@@ -1,7 +1,7 @@
 """Design of trials: the most informative thruster sequences, and their predicted precision.
 
 Imports run down this list, never up: `command` and `demo`; what a program calls
-(`discriminate`, `design`, `prepare`, `precision`); `output`; `certificate` and
+(`discriminate`, `design`, `duration`, `prepare`, `precision`); `output`; `certificate` and
 `feasibility`; `optimise`; `request`; `criteria` and `constraints`; `information`;
 `excitation`.
 

@@ -6,10 +6,10 @@ from experiment_design.constraints.limits import TrialLimits as TrialLimits
 from experiment_design.design import design_trial as design_trial
 from experiment_design.discriminate import Discrimination as Discrimination
 from experiment_design.discriminate import design_between as design_between
+from experiment_design.duration import least_duration as least_duration
 from experiment_design.excitation.inputs import prbs as prbs
 from experiment_design.excitation.inputs import random_two_level as random_two_level
 from experiment_design.excitation.inputs import to_log as to_log
-from experiment_design.optimise.duration import least_duration as least_duration
 from experiment_design.output.result import Design as Design
 from experiment_design.output.result import write_plan as write_plan
 from experiment_design.precision import PredictedPrecision as PredictedPrecision

@@ -398,7 +398,7 @@ def _run_for_coefficients(
     from dataclasses import replace
 
     from experiment_design.design import design_trial
-    from experiment_design.optimise.duration import least_duration
+    from experiment_design.duration import least_duration
 
     asked = _asked(options, model, sailed)
     if sailed is not None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from experiment_design.constraints.kinds.margin import FromZero
 from experiment_design.constraints.limits import TOLERANCE, Circumstances, Limit
+from experiment_design.excitation.schedule import MOST_SAMPLES
 from experiment_design.feasibility.least_violation import (
     least_change,
     moved_constant,
@@ -22,7 +23,6 @@ from experiment_design.optimise.campaign import (
     sums_of_all,
     sums_of_others,
 )
-from experiment_design.optimise.duration import telling_duration
 from experiment_design.optimise.search import Candidate, ascend, assess
 from experiment_design.request.problem import TrialProblem
 from experiment_design.request.regimes import steady_motions
@@ -35,6 +35,8 @@ Array = NDArray[np.float64]
 
 # relative standard error from which nothing was learnt of a parameter
 _VAGUE = 2.0
+# times that a duration is doubled until random sequences tell enough
+_DOUBLINGS = 8
 # evaluations by which it is found out whether a trial tells enough
 _BRIEF = 200
 # shares of what is reached at best that are tried as margins
@@ -74,7 +76,7 @@ def require_informative(
         return []
     vague = [n for n, s in zip(names, share, strict=True) if s > hopeless * _VAGUE]
     if 2 * len(vague) > len(names):
-        longer = telling_duration(request, _VAGUE)
+        longer = _telling_duration(request)
         other = "--want fewer parameters"
         fewer = PREDICTORS[request.predictor].plain
         if request.predictor != fewer:
@@ -95,6 +97,28 @@ def require_informative(
         f"{', '.join(doubtful)} will stay unknown by more than {'its' if one else 'their'} prior "
         f"value: lengthen the trial, or leave {'it' if one else 'them'} out with --want"
     ]
+
+
+def _telling_duration(request: PreparedRequest) -> float | None:
+    """Return a duration at which random sequences tell at least half of the parameters.
+
+    None where they never do, or keep no limits.
+    """
+    duration = request.duration
+    for _ in range(_DOUBLINGS):
+        duration *= 2
+        if duration > MOST_SAMPLES * request.sample_time:
+            return None
+        longer = replace(request, duration=duration)
+        problems = [build_problem(longer, t) for t in range(request.trials)]
+        units, _ = random_campaign(problems, request.seed)
+        if units is None:
+            # limits that no random sequence keeps are kept no longer
+            return None
+        share = std_of(problems, units) / problems[0].criterion.scale
+        if 2 * (share > _VAGUE).sum() <= len(share):
+            return duration
+    return None
 
 
 def missed_targets(

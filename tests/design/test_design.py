@@ -310,7 +310,7 @@ def test_a_target_is_judged_after_the_tightening(monkeypatch):
     drawn = assess(problem, np.random.default_rng(0).random((20, *problem.shape)))
     safe = min(drawn, key=lambda c: c.value)
     monkeypatch.setattr(
-        "experiment_design.optimise.duration.tightened_campaign",
+        "experiment_design.duration.tightened_campaign",
         lambda request, *_, **__: (request, [safe], None, 0),
     )
     std = std_of([problem], [safe.unit])[0]
@@ -346,7 +346,7 @@ def test_a_target_beside_limits_that_cannot_be_kept(monkeypatch):
         missed = [assess(p, np.full((1, *p.shape), 0.5))[0] for p in problems]
         return Found(tuple(replace(c, missed=c.missed + 1) for c in missed), 1, False)
 
-    monkeypatch.setattr("experiment_design.optimise.duration.search_campaign", out_of_reach)
+    monkeypatch.setattr("experiment_design.duration.search_campaign", out_of_reach)
     found = least_duration(make_request(duration=60.0), {"Yvv": 0.02})
     assert found.duration == 60.0
     assert found.targets == (0.02,)

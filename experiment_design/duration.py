@@ -1,4 +1,4 @@
-"""How long a trial must be: to tell most parameters at all, or to wanted standard errors."""
+"""The least duration of a trial that reaches wanted standard errors."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from experiment_design.excitation.schedule import MOST_SAMPLES
 from experiment_design.feasibility.constraint_satisfaction import tightened_campaign
 from experiment_design.optimise.campaign import (
     Progress,
@@ -20,46 +18,10 @@ from experiment_design.optimise.lead_in import after_lead_in
 from experiment_design.request.request import PreparedRequest, build_problem, wanted_columns
 from greybox.errors import InfeasibleError, UsageError
 
-Array = NDArray[np.float64]
-
 # share of the usual search that each tried duration gets
 _QUICK = 0.15
-_DOUBLINGS = 8
 # a duration is settled to this share of itself, or to one hold
 _SETTLED = 0.03
-
-
-def random_shares(request: PreparedRequest) -> Array | None:
-    """Return the relative standard errors that the best random two-level campaign would give."""
-    problems = [build_problem(request, t) for t in range(request.trials)]
-    units, _ = random_campaign(problems, request.seed)
-    if units is None:
-        return None
-    return std_of(problems, units) / problems[0].criterion.scale
-
-
-def telling_duration(request: PreparedRequest, vague: float) -> float | None:
-    """Return a duration at which random sequences tell at least half of the parameters.
-
-    None where they never do, or keep no limits.
-
-    Parameters
-    ----------
-    vague : float
-        Relative standard error from which nothing was learnt.
-    """
-    duration = request.duration
-    for _ in range(_DOUBLINGS):
-        duration *= 2
-        if duration > MOST_SAMPLES * request.sample_time:
-            return None
-        share = random_shares(replace(request, duration=duration))
-        if share is None:
-            # limits that no random sequence keeps are kept no longer
-            return None
-        if 2 * (share > vague).sum() <= len(share):
-            return duration
-    return None
 
 
 def least_duration(
