@@ -122,11 +122,14 @@ class Discrimination(DisplayMixin):
     def summary(self) -> str:
         """Return the result as text."""
         a, b = self.names
+        random = "no random sequence keeps the limits"
+        if np.isfinite(self.random):
+            random = f"best random two-level sequence {self.random:.3g}"
         lines = [
             f"Trial of {self.design.request.duration:g} s between {a} and {b}",
             self.design.status,
             f"expected log-likelihood ratio: {self.ratio[0]:.3g} if {a} is true, "
-            f"{self.ratio[1]:.3g} if {b} is; best random two-level sequence {self.random:.3g}",
+            f"{self.ratio[1]:.3g} if {b} is; {random}",
             f"the likelihood will decide rightly with probability {self.probability:.4f} for the "
             f"models as they are, {self.probability_refitted:.4f} when the wrong one is fitted to "
             f"the new trial",

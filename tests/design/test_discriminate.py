@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from designs import make_request, thesis_model
 
 from experiment_design import CandidateModel, design_between, design_trial
 from experiment_design.criteria.t_optimality import Pair
-from experiment_design.discriminate import probability_right
+from experiment_design.discriminate import Discrimination, probability_right
 from experiment_design.request.request import build_problem
 from greybox.commands.main import main
 from greybox.errors import UsageError
@@ -141,6 +142,15 @@ def test_a_designed_trial_tells_more_than_a_random_one():
     contrasts = ((_first(request), rival),)
     pair = build_problem(replace(request, contrasts=contrasts)).contrast.pairs[0]
     assert pair.distance(found.design.commands[0]) > pair.distance(plain.commands[0])
+
+
+def test_no_random_sequence_that_keeps_the_limits_is_told_in_words():
+    plan = SimpleNamespace(request=SimpleNamespace(duration=60.0), status="solved", notes=())
+    found = Discrimination(plan, ("a", "b"), (9.0, 8.0), (7.0, 6.0), False, float("nan"))
+    told = found.summary()
+    assert "8 if b is; no random sequence keeps the limits" in told
+    assert "nan" not in told
+    assert "best random two-level sequence 3.2" in replace(found, random=3.2).summary()
 
 
 def test_explanations_that_are_one():
