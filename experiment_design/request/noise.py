@@ -68,8 +68,9 @@ def noise_levels(
     if missing and not has_residual:
         raise UsageError(
             f"nothing tells how noisy {', '.join(missing)} "
-            f"{'is' if len(missing) == 1 else 'are'}: state {missing[0]}_std under [sensors] in "
-            f"the vessel file, or design with a model that was estimated."
+            f"{'is' if len(missing) == 1 else 'are'}: state "
+            f"{', '.join(f'{s}_std' for s in missing)} under [sensors] in the vessel file, or "
+            f"design with a model that was estimated."
         )
     # without a stated sensor, half of the residual is taken as the sensor's
     measurement = np.array(

@@ -242,7 +242,9 @@ def test_noise_levels_from_residuals_and_sensors():
     with pytest.raises(UsageError, match="one that is not negative is needed for each of u, v, r"):
         noise_levels(model, model.vessel, np.array([1.0]))
     blind = replace(model, vessel=load_vessel("ferry"))
-    with pytest.raises(UsageError, match="nothing tells how noisy u"):
+    with pytest.raises(
+        UsageError, match=r"nothing tells how noisy u, v, r are: state u_std, v_std, r_std under"
+    ):
         noise_levels(replace(blind, vessel=replace(blind.vessel, sensors={})),
                      replace(blind.vessel, sensors={}))  # fmt: skip
     with pytest.raises(UsageError, match="the noise of u is 0"):
