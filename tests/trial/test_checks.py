@@ -227,6 +227,17 @@ def test_without_a_velocity_sensor_the_course_tells_heading_from_rate(name, wide
     assert (finding.id, finding.channel, finding.safe) == found
 
 
+@pytest.mark.parametrize(
+    ("gone", "lacks"),
+    [(("u", "v"), "no velocity sensor of its own"), (("x_n", "y_n"), "no positions")],
+)
+def test_what_the_clocks_lack_is_said(gone, lacks, ship):
+    d = recorded(0, 2.0, seconds=120.0)
+    report = check_recording(as_recording({n: d[n] for n in d if n not in gone}), ship)
+    clock = next(o for o in report.outcomes if o.id == "clock_offset")
+    assert f"{lacks} to tell which" in clock.sentence
+
+
 def test_without_a_course_heading_and_rate_are_both_in_doubt(ship):
     d = negate(recorded(0, 2.0, seconds=300.0, wide=True), "r")
     d = {n: v for n, v in d.items() if n in ("t", "psi", "r")}

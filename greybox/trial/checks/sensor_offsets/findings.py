@@ -339,12 +339,10 @@ def _outcomes(campaign: Campaign, told: list[Defect], vessel: Vessel) -> list[Ou
     outcomes = []
     if "clock_offset" not in found:
         if apart:
-            outcomes.append(
-                Outcome(
-                    "clock_offset", "clean",
-                    f"heading against yaw rate; no positions to tell which{together}",
-                )
-            )  # fmt: skip
+            positioned = any("x_n" in r for r in campaign.recordings)
+            lacks = "velocity sensor of its own" if positioned else "positions"
+            said = f"heading against yaw rate; no {lacks} to tell which{together}"
+            outcomes.append(Outcome("clock_offset", "clean", said))
         else:
             outcomes.append(_clock_outcome(campaign, information, basis, together))
     if apart:
