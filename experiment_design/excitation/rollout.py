@@ -137,13 +137,12 @@ class Rollout:
         )
         samples = commands.shape[1]
         heading = None if "r" in structure.states else np.full(samples + 1, self.start[-1])
-        bound = np.array([_BOUND.get(n, 1e6) for n in structure.states])
         free = simulate(
             structure, theta, self.start[:-1], tau, self.sample_time,
             psi=heading, psi0=float(self.start[-1]),
             d=np.broadcast_to(self.d, (samples, self.d.size)) if self.d.any() else None,
             integrator=self.integrator,
-            bound=bound,
+            bound=plausible_bounds(structure.states),
         )  # fmt: skip
         stable = free.diverged < 0
         with np.errstate(invalid="ignore", over="ignore"):
@@ -226,6 +225,11 @@ class Rollout:
             blocks.append(out[first : first + rows * columns].reshape(rows, columns, *shape))
             first += rows * columns
         return blocks
+
+
+def plausible_bounds(states: tuple[str, ...]) -> Array:
+    """Return the size (nx,) of each state past which a run counts as unstable."""
+    return np.array([_BOUND.get(n, 1e6) for n in states])
 
 
 def force_vector(vessel: Vessel, structure: Structure, commands: ca.SX) -> ca.SX:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from experiment_design.constraints.kinds.sea_room import edge_distance
+from experiment_design.excitation.rollout import plausible_bounds
 from experiment_design.output.result import Design
 from experiment_design.request.request import build_problem
 from greybox.model.run.simulation import positions, simulate
@@ -16,8 +17,6 @@ from greybox.vessel.actuation import actuated_force
 
 Array = NDArray[np.float64]
 
-# speed [m/s] or rate [rad/s] past which a drawn model counts as running away
-_BOUND = 100.0
 _QUANTILES = (0.025, 0.975)
 # share of the drawn motions that stay in the corridor all the way
 _CORRIDOR = 0.95
@@ -60,7 +59,7 @@ class MotionBand:
     draws : int
         Motions that the quantiles are over; 1 where nothing is uncertain.
     lost : int
-        Draws that ran away and are left out.
+        Draws that left every plausible bound and are left out.
     """
 
     trial: int
@@ -124,6 +123,7 @@ def predict_motion(design: Design, draws: int = 200) -> tuple[MotionBand, ...]:
         draws = 1
     thetas = r.draw_models(draws, 2)
     states = r.structure.states
+    bound = plausible_bounds(states)
     found = []
     for trial, commands in enumerate(design.commands):
         start, samples = r.starts[trial], len(commands)
@@ -141,13 +141,16 @@ def predict_motion(design: Design, draws: int = 200) -> tuple[MotionBand, ...]:
             d=np.broadcast_to(r.d, (samples, r.d.size)) if r.d.any() else None,
             process_noise=noise,
             integrator=r.integrator,
-            bound=np.full(len(states), _BOUND),
+            bound=bound,
         )  # fmt: skip
         stable = free.diverged < 0
         x, psi = free.x[stable], np.asarray(free.psi)[stable]
         if r.misfit is not None:
             rollout = build_problem(r, trial).scenarios[0].rollout
             x, psi = rollout.off(x, psi, r.misfit(design.motions[trial], draws)[stable])
+            kept = (np.abs(x) <= bound).all(axis=(1, 2))
+            stable[stable] = kept
+            x, psi = x[kept], psi[kept]
         names, drawn = _signals(design, x, psi)
         nominal = _signals(design, *_nominal(design, trial))[1][0]
         if draws == 1 or not len(drawn):

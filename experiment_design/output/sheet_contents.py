@@ -24,6 +24,9 @@ HEADING_FLOOR = np.deg2rad(10.0)
 POSITION_FLOOR = 10.0
 # heading past which "off the plan" has no meaning
 _BLIND = np.deg2rad(90.0)
+# what no cap limits is stopped at this over the band's edge, at most at that over the plan's own
+# largest value: the band of a poor model ends nowhere
+_OVER, _MOST = 1.1, 1.5
 _LONGEST_NAME = 60
 _SIDES = {
     ("u", 1): "ahead",
@@ -306,33 +309,36 @@ def corridor(design: Design, band: MotionBand) -> tuple[Array, Array]:
     return np.maximum(band.heading_off, HEADING_FLOOR), np.maximum(band.position_off, floor)
 
 
+def _over(largest: float, edge: float) -> tuple[float, str]:
+    """Return where a plan without a cap is stopped, by its largest value and its band's edge."""
+    over = min(_OVER * max(largest, edge), _MOST * largest)
+    share = 100 * (over / largest - 1) if largest else 0.0
+    return over, (
+        f", {share:.0f} % more than the plan's largest; no cap was set: stop, and tell who "
+        f"planned the trial"
+    )
+
+
 def _abort(design: Design, band: MotionBand) -> tuple[str, ...]:
     r = design.request
     limits = r.limits
     said = []
-    speed = band["speed"]
-    most = max(speed.nominal.max(), speed.high.max())
-    if limits.speed_cap is not None:
-        said.append(
-            f"Speed over ground above {limits.speed_cap:.2f} m/s ({limits.speed_cap / KNOT:.1f} "
-            f"kn); expected at most {most:.2f} m/s."
-        )
-    else:
-        over = 1.1 * most
-        said.append(
-            f"Speed over ground above {over:.2f} m/s ({over / KNOT:.1f} kn), 10 % more than "
-            f"expected; no cap was set."
-        )
+    largest = float(band["speed"].nominal.max())
+    cap, why = limits.speed_cap, f"; the plan's largest is {largest:.2f} m/s"
+    if cap is None:
+        cap, why = _over(largest, float(band["speed"].high.max()))
+    said.append(f"Speed over ground above {cap:.2f} m/s ({cap / KNOT:.1f} kn){why}.")
     if "r" in band:
         rate = band["r"]
-        most = float(np.abs([rate.nominal, rate.low, rate.high]).max())
-        cap, why = limits.yaw_cap, f"expected at most {np.rad2deg(most):.1f}°/s"
+        largest = float(np.abs(rate.nominal).max())
+        cap, why = limits.yaw_cap, f"; the plan's largest is {np.rad2deg(largest):.1f}°/s"
         if cap is None:
-            cap, why = 1.1 * most, "10 % more than expected; no cap was set"
-        said.append(
-            f"Yaw rate above {np.rad2deg(cap):.1f}°/s ({cap:.3f} rad/s) to either side"
-            + (f"; {why}." if limits.yaw_cap is not None else f", {why}.")
-        )
+            cap, why = _over(largest, float(np.abs([rate.low, rate.high]).max()))
+        # a plan that does not turn is left by its heading
+        if round(np.rad2deg(cap), 1):
+            said.append(
+                f"Yaw rate above {np.rad2deg(cap):.1f}°/s ({cap:.3f} rad/s) to either side{why}."
+            )
     if "edge" in band:
         edge = band["edge"]
         text = (

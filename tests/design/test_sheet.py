@@ -173,6 +173,36 @@ def test_abort_limits_in_words(unsure, known):
     assert "no cap was set" in said
 
 
+@pytest.mark.parametrize(("wide", "over"), [(1.0, 10), (1.2, 32), (4.0, 50)])
+def test_without_a_cap_the_plan_itself_sets_the_limits(known, wide, over):
+    (band,) = predict_motion(known)
+    poor = replace(band, high=wide * band.nominal, low=-wide * band.nominal)
+    speed, rate, *_ = sheet_contents(known, poor).abort
+    most = (1 + over / 100) * band["speed"].nominal.max()
+    turn = (1 + over / 100) * np.rad2deg(np.abs(band["r"].nominal).max())
+    assert speed.startswith(f"Speed over ground above {most:.2f} m/s")
+    assert rate.startswith(f"Yaw rate above {turn:.1f}°/s")
+    for said in (speed, rate):
+        assert f"{over} % more than the plan's largest" in said
+        assert said.endswith("stop, and tell who planned the trial.")
+
+
+def test_draws_that_the_misfit_throws_out_of_every_bound_are_lost(known):
+    nx = len(known.request.structure.states)
+
+    def misfit(motion, draws):
+        off = np.zeros((draws, len(motion.state[0]), nx))
+        off[:3, -1, -1] = 20.0
+        return off
+
+    zero = np.zeros((len(known.request.theta),) * 2)
+    zero[0, 0] = 1e-20
+    request = replace(known.request, covariance=zero, misfit=misfit)
+    (band,) = predict_motion(replace(known, request=request), draws=50)
+    assert band.lost == 3
+    np.testing.assert_allclose(band["r"].high, band["r"].nominal, atol=1e-6)
+
+
 def test_wind_is_named_by_where_it_comes_from(known):
     design = replace(known, request=replace(known.request, d=np.array([0, 0, -5.0, 0])))
     (band,) = predict_motion(known)
