@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from greybox.errors import LogError
+from greybox.trial.convert.channel_mapping import read_recording
 from greybox.trial.convert.read import read_log
 from greybox.trial.import_files import import_files
 from greybox.vessel.toml import vessel_from_dict
@@ -50,6 +51,21 @@ def test_a_unit_in_the_name_of_a_column_is_given(tmp_path, raw):
     frame = table().rename(columns={"yaw": raw})
     log = imported(tmp_path, vessel({"tvec": "t", raw: "psi"}), frame)
     np.testing.assert_allclose(log["psi"], np.radians(0.1 * log.t), atol=1e-9)
+
+
+def test_a_thruster_column_with_a_unit_in_brackets_is_found(tmp_path):
+    rudder = {"type": "propeller_rudder", "speed": "n_prop", "rudder": "delta"}
+    ship = vessel_from_dict({"name": "V", "length": 10, "thruster": [rudder]})
+    frame = table(**{"t": T, "n_prop [rps]": 5 + T, "delta (deg)": T}).drop(columns=["tvec", "n"])
+    log = imported(tmp_path, ship, frame)
+    # a propeller speed keeps its unit, an angle is in rad
+    np.testing.assert_allclose(log["n_prop"], 5 + log.t, atol=1e-9)
+    np.testing.assert_allclose(log["delta"], np.radians(log.t), atol=1e-9)
+    read = read_recording(tmp_path / "raw0.csv", ship)
+    assert "n_prop [rps] taken for n_prop" in read.notes
+    # of two units neither is the right one
+    frame.assign(**{"n_prop [rpm]": 60.0}).to_csv(tmp_path / "two.csv", index=False)
+    assert "n_prop" not in read_recording(tmp_path / "two.csv", ship)
 
 
 def test_unix_nanoseconds_are_no_seconds(tmp_path):

@@ -85,15 +85,18 @@ class Assigned:
 
 def split_unit(raw: str) -> tuple[str, str | None]:
     """Part a column name into its stem, lower case, and the unit that it carries."""
-    unit: str | None = None
-    bracket = re.search(r"[\[(]\s*([^\])]*)\s*[\])]\s*$", raw)
-    stem = raw
-    if bracket:
-        unit = spelled_unit(bracket.group(1))
-        stem = raw[: bracket.start()]
-    stem = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", stem.strip())
+    stem, unit = _without_brackets(raw)
+    stem = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", stem)
     stem = re.sub(r"[^0-9a-zA-Z]+", "_", stem).strip("_").lower()
     return suffix_unit(stem) if unit is None else (stem, unit)
+
+
+def _without_brackets(raw: str) -> tuple[str, str | None]:
+    """Part a column name from the unit that stands in brackets behind it."""
+    bracket = re.search(r"[\[(]\s*([^\])]*)\s*[\])]\s*$", raw)
+    if bracket is None:
+        return raw.strip(), None
+    return raw[: bracket.start()].strip(), spelled_unit(bracket.group(1))
 
 
 def assign(
@@ -114,7 +117,7 @@ def assign(
         Names in the source.
     vessel : Vessel
         Its ``[columns]`` come first, then exact canonical names and thruster
-        columns, then guesses.
+        columns, then thruster columns with a unit in brackets, then guesses.
     units : mapping of str to str, optional
         Units that the source states beside its names.
     canonical : iterable of str
@@ -171,6 +174,17 @@ def assign(
     if not guess:
         return found
     taken |= set(parts)
+    for name in (c for c in vessel.recorded_columns if c not in found):
+        named = [raw for raw in columns if raw not in taken and _without_brackets(raw)[0] == name]
+        # of two, such as in rpm and in rps, neither is it
+        if len(named) == 1:
+            (raw,), target = named, vessel.unit(name)
+            unit = units.get(raw, _without_brackets(raw)[1])
+            if unit is None or target is None or _fits(unit, target):
+                # what has no unit of its own is kept as it is
+                unit = unit if target else None
+                found[name] = Assigned(raw, name, unit, 1, "guessed")
+                taken.add(raw)
     stems = {raw: split_unit(raw.rsplit(".", 1)[-1]) for raw in columns if raw not in taken}
     for name, spellings in _GUESSES.items():
         if name in found or _pointless(name, found):
