@@ -126,9 +126,11 @@ def prepare(
         require_commands(logs)
     else:
         _require_ship(model, [*logs, *validate])
-    kinematics = judged_by_kinematics([*logs, *validate])
+    stated = logs[0].vessel if model is None else model.vessel
+    # what is found is beyond what is stated already
+    kinematics = judged_by_kinematics([correct_log(log, stated) for log in (*logs, *validate)])
     findings = [f for f in kinematics.findings if f.id in causes]
-    vessel = mended(logs[0].vessel if model is None else model.vessel, findings)
+    vessel = mended(stated, findings)
     logs = [correct_log(log, vessel) for log in logs]
     validate = [correct_log(log, vessel) for log in validate]
     start = _structure(structure, logs, model)

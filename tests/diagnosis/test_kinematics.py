@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,10 @@ import pytest
 from foreign_ships import write_campaign
 
 from greybox.diagnosis.causes import known_causes
-from greybox.diagnosis.evidence.kinematics import causes_of, judged_by_kinematics
+from greybox.diagnosis.evidence.kinematics import causes_of, judged_by_kinematics, mended
 from greybox.diagnosis.preparing import prepare
+from greybox.model.catalogue import get_structure
+from greybox.model.model import ManoeuvringModel
 from greybox.study.blind import draw
 from greybox.trial.checks.finding import Finding
 from greybox.trial.convert.read import read_log
@@ -69,3 +72,60 @@ def test_two_late_clocks_are_both_told() -> None:
     told = causes_of(findings, known_causes(), 40)
     assert [c.key for c in told] == ["clock_offset:x_n:kinematics", "clock_offset:y_n:kinematics"]
     assert [q.value for c in told for q in c.parameters.values()] == [2.0, 3.0]
+
+
+def _stated(effect) -> dict[str, object]:
+    true = effect.parameters
+    if effect.id == "heading_bias":
+        return {"heading_bias": true["heading_bias"]}
+    if effect.id == "lever_arm":
+        return {"antenna": (true["lever_arm_x"], true["lever_arm_y"])}
+    if effect.id == "sign":
+        return {"reversed": (true["channel"],)}
+    return {"clock": {"u": true["clock_u"]}}
+
+
+@pytest.mark.parametrize(
+    ("effect", "seed"), [("heading_bias", 1), ("lever_arm", 2), ("clock_offset", 0), ("sign", 1)]
+)
+def test_what_a_model_knows_of_its_sensors_is_not_found_again(effect: str, seed: int) -> None:
+    trial = draw(np.random.default_rng([31, seed]), (effect,), samples=400)
+    structure = get_structure("thesis").without("Wuu", "Wvv", "Wuv")
+    size = len(structure.parameters)
+    vessel = trial.estimation.vessel
+    vessel = replace(vessel, sensors={**vessel.sensors, **_stated(trial.truth[0])})
+    model = ManoeuvringModel(structure, np.zeros(size), np.zeros((size, size)), 1.0, vessel)
+    assert judged_by_kinematics([trial.estimation]).findings
+    ready = prepare([trial.estimation], [], model, "thesis", [effect])
+    assert not ready.findings
+    assert ready.case.logs[0].vessel.sensors == vessel.sensors
+
+
+def test_what_is_found_of_sensors_comes_on_top_of_what_is_stated_but_an_arm() -> None:
+    def found(id: str, channel: str, value, *channels: str) -> Finding:
+        return Finding(id, channel, value, (0.0, 0.0), "", "", "", channels)
+
+    stated = {
+        "heading_bias": 0.1, "antenna": (1.0, 2.0, 3.0), "clock": {"u": 1.0}, "reversed": ("v",),
+    }  # fmt: skip
+    vessel = replace(load_vessel("ferry"), sensors=stated)
+    findings = [
+        found("heading_bias", "psi", 0.02), found("lever_arm", "x_n", (4.0, 5.0)),
+        found("clock_offset", "u", 0.5, "u", "v"), found("sign", "v", -1.0, "v", "r"),
+    ]  # fmt: skip
+    sensors = mended(vessel, findings).sensors
+    assert sensors["heading_bias"] == pytest.approx(0.12)
+    # the checks tell it from the origin, whatever the vessel file says
+    assert sensors["antenna"] == (4.0, 5.0, 3.0)
+    assert sensors["clock"] == {"u": 1.5, "v": 0.5}
+    assert sensors["reversed"] == ("r",)
+
+
+def test_a_channel_that_is_reversed_in_one_log_is_reversed_in_no_other() -> None:
+    trial = draw(np.random.default_rng([31, 7]), (), samples=400)
+    logs = [
+        replace(log, channels={**log.channels, name: -log[name]})
+        for log, name in ((trial.estimation, "v"), (trial.validation, "u"))
+    ]
+    assert [f.id for f in judged_by_kinematics(logs[:1]).findings] == ["sign"]
+    assert not judged_by_kinematics(logs).findings

@@ -71,14 +71,19 @@ def judged_by_kinematics(logs: Sequence[TrialLog]) -> Kinematics:
     except GreyboxError:
         return Kinematics()
     each = [[f for f in report.findings if _kinematic(f)] for report in reports]
-    shared = set.intersection(*({f.id for f in found} for found in each))
+    shared = set.intersection(*({_place(f) for f in found} for found in each))
     clean = [
         {place for o in report.outcomes if o.status == "clean" for place in _places(o)}
         for report in reports
     ]
     return Kinematics(
-        tuple(f for f in each[0] if f.id in shared), frozenset(set.intersection(*clean))
+        tuple(f for f in each[0] if _place(f) in shared), frozenset(set.intersection(*clean))
     )
+
+
+def _place(finding: Finding) -> tuple[str, frozenset[str]]:
+    """Return what a finding is of, and where."""
+    return finding.id, frozenset(finding.channels or (finding.channel,))
 
 
 def decided(findings: Sequence[Finding]) -> frozenset[str]:
@@ -137,24 +142,29 @@ def found_by_checks(finding: Finding, cause: Cause, tried: int) -> Found:
 
 
 def mended(vessel: Vessel, findings: Sequence[Finding]) -> Vessel:
-    """Return the vessel with what the findings say of its sensors."""
+    """Return the vessel with what the findings say of its sensors.
+
+    They are of logs that are corrected for what the vessel states already. Nothing moves positions,
+    so that a lever arm is one from the origin, and all the others come on top of what is stated.
+    """
     said = dict(vessel.sensors)
     for finding in findings:
         if finding.id == "heading_bias" and isinstance(finding.value, float):
             said["heading_bias"] = said.get("heading_bias", 0.0) + finding.value
         if finding.id == "lever_arm" and isinstance(finding.value, tuple):
-            before = tuple(said.get("antenna", (0.0, 0.0)))
-            said["antenna"] = tuple(
-                float(a + b) for a, b in zip(before, (*finding.value, 0.0), strict=False)
-            )
+            height = tuple(said.get("antenna", ()))[2:]
+            said["antenna"] = (*map(float, finding.value), *height)
         if finding.id == "clock_offset" and isinstance(finding.value, float):
             clock = dict(said.get("clock", {}))
             for name in finding.channels or (finding.channel,):
                 clock[name] = clock.get(name, 0.0) + finding.value
             said["clock"] = clock
         if finding.id == "sign":
-            turned = finding.channels or (finding.channel,)
-            said["reversed"] = tuple(dict.fromkeys([*said.get("reversed", ()), *turned]))
+            turned = dict.fromkeys(finding.channels or (finding.channel,))
+            before = tuple(said.get("reversed", ()))
+            said["reversed"] = (
+                *(c for c in before if c not in turned), *(c for c in turned if c not in before),
+            )  # fmt: skip
     return replace(vessel, sensors=said)
 
 
