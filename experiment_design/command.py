@@ -533,13 +533,12 @@ def _prepared(
 
     from experiment_design.after import lacking_margin
     from experiment_design.prepare import prepare_request
+    from experiment_design.request.regimes import state_words
     from greybox.errors import InfeasibleError
 
     if sailed is None or options.start is not None:
         return prepare_request(model, asked, vessel), False
-    ended = ", ".join(
-        f"{n} {x:.3g}" for n, x in zip((*model.structure.states, "psi"), sailed.end, strict=True)
-    )
+    ended = state_words(model.structure.states, sailed.end)
     try:
         found = prepare_request(model, replace(asked, start=sailed.end), vessel)
         lacking = lacking_margin(found)

@@ -21,6 +21,7 @@ from experiment_design.for_prediction import (
     command_ranges,
     described_plan,
     operating_envelope,
+    started_in,
     tightened_search,
 )
 from experiment_design.optimise.envelope_search import (
@@ -367,9 +368,7 @@ def design_for_causes(
     require_horizon(request)
     causes, tried, notes = open_causes(request, model, asked)
     found, _ = operating_envelope(request, model, envelope or {})
-    request = replace(request, misfit=found.misled)
-    if not kept_start:
-        request = replace(request, starts=(found.rollout.start,))
+    request = replace(started_in(request, found, int(kept_start)), misfit=found.misled)
     problem = build_problem(request)
     rollout, schedule = problem.scenarios[0].rollout, problem.schedule
     usual = rollout.run(

@@ -31,6 +31,7 @@ from experiment_design.optimise.lead_in import after_lead_in
 from experiment_design.optimise.search import assess
 from experiment_design.output.result import Design, PlanPart
 from experiment_design.request.exclusions import require_compatible
+from experiment_design.request.regimes import start_words
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.diagnosis.result import finite
 from greybox.errors import InfeasibleError
@@ -302,9 +303,7 @@ def _design(
     require_horizon(request)
     found, level = operating_envelope(request, model, given)
     states = request.structure.states
-    others = (found.rollout.start,) * request.trials
-    starts = (*request.starts[:kept_starts], *others[kept_starts:])
-    asked = replace(request, starts=starts, misfit=found.misled)
+    asked = replace(started_in(request, found, kept_starts), misfit=found.misled)
     if kept_starts:
         asked = after_lead_in(asked)
     before = log_moments(found, sailed)
@@ -337,11 +336,22 @@ def _design(
     )  # fmt: skip
 
 
-def _of_start(start: str, kept: int, trials: int) -> tuple[str, ...]:
-    if kept >= trials:
+def started_in(request: PreparedRequest, envelope: Envelope, kept: int) -> PreparedRequest:
+    """Return the request whose trials but the first few start on a course in the envelope."""
+    others = request.trials - kept
+    given = request.start_commands or (None,) * request.trials
+    return replace(
+        request,
+        starts=(*request.starts[:kept], *(envelope.rollout.start,) * others),
+        start_commands=(*given[:kept], *(envelope.begun,) * others),
+    )
+
+
+def _of_start(request: PreparedRequest, kept: int) -> tuple[str, ...]:
+    if kept >= request.trials:
         return ()
     which = "each trial but the first starts" if kept else "each trial starts"
-    return (f"{which} from a steady motion: {start} (--start to change)",)
+    return (f"{which} from a steady motion: {start_words(request, -1)} (--start to change)",)
 
 
 def _parts(request: PreparedRequest, led: tuple[PlanPart, ...], usual: int) -> tuple[PlanPart, ...]:
@@ -401,13 +411,11 @@ def described_plan(
             f"--envelope."
         )
     reference, number = random_campaign(problems, request.seed)
-    shown = zip((*request.structure.states, "psi"), request.starts[-1], strict=True)
-    start = ", ".join(f"{n} {x:.3g}" for n, x in shown)
     return described(
         request, problems, [s.candidate.unit for s in searches], reference, number,
         certificate=absent(certificate), keeping=keeping,
         status="solved: exchange of settings of the operating envelope",
-        notes=_of_start(start, kept_starts, request.trials),
+        notes=_of_start(request, kept_starts),
         evaluations=sum(s.evaluations for s in searches), began=began,
     )  # fmt: skip
 

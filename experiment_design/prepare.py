@@ -26,10 +26,12 @@ from experiment_design.request.exclusions import (
 from experiment_design.request.noise import noise_levels
 from experiment_design.request.regimes import (
     Signs,
+    Start,
     Steady,
     candidate_regimes,
     parse_regime,
     spell_regime,
+    start_words,
     steady_motions,
     steady_start,
 )
@@ -199,23 +201,24 @@ def prepare_request(
     if start is None and not automatic:
         for signs in regimes:
             begin = steady_start(steady, structure.states, signs, margins, caps)
-            if begin is not None and _depth(begin, signs, margins, structure.states) < -1e-6:
+            if begin is not None and _depth(begin.state, signs, margins, structure.states) < -1e-6:
                 raise InfeasibleError(_beyond_reach(base, steady, [signs], asked.limits))
-    starts = tuple(
+    begun = [
         _start_of(signs, start, steady, structure, margins, caps, asked.trials) for signs in regimes
+    ]
+    base = replace(
+        base,
+        regimes=regimes,
+        starts=tuple(s.state if s.state is start else _clear_of_wind(s.state, base) for s in begun),
+        start_commands=tuple(s.commands for s in begun),
     )
-    starts = tuple(s if s is start else _clear_of_wind(s, base) for s in starts)
     if start is None:
-        shown = ", ".join(
-            f"{n} {v:.2f}" for n, v in zip((*structure.states, "psi"), starts[0], strict=True)
-        )
         of_regime.append(
-            f"the first trial starts from a steady motion: {shown} (--start to change)"
+            f"the first trial starts from a steady motion: {start_words(base, 0)} "
+            f"(--start to change)"
         )
         notes.append(of_regime[-1])
-    return replace(
-        base, regimes=regimes, starts=starts, notes=tuple(notes), of_regime=tuple(of_regime)
-    )
+    return replace(base, notes=tuple(notes), of_regime=tuple(of_regime))
 
 
 def expected_disturbances(model: ManoeuvringModel, asked: DesignRequest) -> Array:
@@ -334,9 +337,9 @@ def _start_of(
     margins: dict[str, float],
     caps: tuple[float | None, float | None],
     trials: int,
-) -> Array:
+) -> Start:
     if start is not None and all(start[structure.states.index(s)] * v >= 0 for s, v in signs):
-        return start
+        return Start(start)
     if start is not None and trials == 1:
         name, sign = next((s, v) for s, v in signs if start[structure.states.index(s)] * v < 0)
         raise InfeasibleError(
@@ -409,7 +412,7 @@ def _beyond_reach(
         eased = replace(
             base,
             regimes=(held,) * base.trials,
-            starts=(_clear_of_wind(start, base),) * base.trials,
+            starts=(_clear_of_wind(start.state, base),) * base.trials,
             limits=replace(base.limits, margins=asked | margins),
         )
         if tells_enough(eased):
@@ -434,7 +437,7 @@ def _choose_regimes(
         begin = steady_start(steady, states, signs, margins, caps)
         if begin is None:
             continue
-        own = _clear_of_wind(begin, base)
+        own = _clear_of_wind(begin.state, base)
         if start is not None:
             if any(start[states.index(s)] * v < 0 for s, v in signs):
                 if asked.trials == 1:

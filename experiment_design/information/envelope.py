@@ -64,6 +64,8 @@ class Envelope:
     ----------
     rollout : Rollout
         The prior model, from a steady motion of the envelope.
+    begun : ndarray
+        (nc,) constant commands that hold the ship in that motion.
     predictor : Predictor
         Whose columns are the primary terms.
     variance : ndarray
@@ -89,6 +91,7 @@ class Envelope:
     """
 
     rollout: Rollout
+    begun: Array
     predictor: Predictor
     variance: Array
     lower: Array
@@ -359,10 +362,11 @@ def build_envelope(
     if held.any():
         # where a crew would begin: on a course, at speed
         course = _straight(steady[held])
-        begun = course[int(steady[held][course, 0].argmax())]
+        best = course[int(steady[held][course, 0].argmax())]
+        begun = tried[held][best]
         rollout = Rollout(
             rollout.vessel, rollout.structure, rollout.theta, rollout.d,
-            np.append(steady[held][begun], 0.0), dt, rollout.integrator,
+            np.append(steady[held][best], 0.0), dt, rollout.integrator,
         )  # fmt: skip
         motion = rollout.run(np.repeat(tried[:, None], int(HOLDS[1] * scale / dt), axis=1))
         # until when a setting keeps the ship within the envelope, at most the longest hold
@@ -407,8 +411,8 @@ def build_envelope(
     variance = np.asarray(noise.measurement, float) ** 2 + lasting * by_step
     precision = np.concatenate([np.zeros(len(predictor.columns)), 1 / tau])
     return Envelope(
-        rollout, predictor, variance, lower, upper, shown, settings, kept * dt, reached, straight,
-        scale, share, spread, features, moments, precision,
+        rollout, begun, predictor, variance, lower, upper, shown, settings, kept * dt, reached,
+        straight, scale, share, spread, features, moments, precision,
     )  # fmt: skip
 
 

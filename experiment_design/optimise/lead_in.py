@@ -18,6 +18,7 @@ from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TOLERANCE, Limit, PathLimit
 from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.excitation.schedule import Schedule
+from experiment_design.request.regimes import state_words
 from experiment_design.request.request import LeadIn, PreparedRequest, build_problem
 from greybox.errors import InfeasibleError
 
@@ -219,8 +220,7 @@ def _refusal(request: PreparedRequest, holds: int) -> str:
     """Return which limit stops a lead-in, and the least change that was found to help."""
     shooting = _Shooting(request, holds)
     missed = shooting.nearest()
-    states = (*request.structure.states, "psi")
-    start = ", ".join(f"{n} {x:.3g}" for n, x in zip(states, request.starts[0], strict=True))
+    start = state_words(request.structure.states, request.starts[0])
     constant = shooting.time_constant()
     told = f" ({LONGEST / constant:.2g} time constants of this ship)" if constant < np.inf else ""
     said = (

@@ -218,6 +218,9 @@ class Design(DisplayMixin):
                 dict(zip((*r.structure.states, "psi"), s, strict=True))
                 for s in r.from_first_command().starts
             ],
+            "start_commands": [
+                r.from_first_command().commands_at_start(t) for t in range(r.trials)
+            ],
             "random_kept": self.random_kept,
             "certificate": self.certificate.to_dict(),
             "limits": [

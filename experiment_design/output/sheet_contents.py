@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -194,10 +195,17 @@ def leg_words(leg: Leg, design: Design, trial: int) -> str:
     trial : int
         Counted from 0.
     """
+    words = _command_words(leg.commands, design)
+    start = float(design.request.starts[trial][-1])
+    return f"{words[0].upper()}{words[1:]}; {_until_words(leg, start)}"
+
+
+def _command_words(commands: Mapping[str, float], design: Design) -> str:
+    """Return one command each, rudders first, such as rudder port 20.1°, n 11.0."""
     r = design.request
     rudders = [t.rudder for t in r.vessel.thrusters if t.rudder is not None]
     said = []
-    for i, (name, value) in enumerate(leg.commands.items()):
+    for i, (name, value) in enumerate(commands.items()):
         if name not in r.vessel.angle_commands:
             span = float(r.schedule.upper[i] - r.schedule.lower[i])
             said.append(f"{name} {_speed_cells(np.array([value]), span)[0]}")
@@ -207,8 +215,7 @@ def leg_words(leg: Leg, design: Design, trial: int) -> str:
             what = "rudder" if len(set(rudders)) == 1 else f"rudder {name}"
         angle = degrees(value)
         said.append(f"{what} {side(value)} {angle}" if angle != "0°" else f"{what} midships")
-    words = ", ".join(sorted(said, key=lambda text: not text.startswith("rudder")))
-    return f"{words[0].upper()}{words[1:]}; {_until_words(leg, float(r.starts[trial][-1]))}"
+    return ", ".join(sorted(said, key=lambda text: not text.startswith("rudder")))
 
 
 def side(value: float) -> str:
@@ -258,6 +265,9 @@ def _facts(design: Design, band: MotionBand) -> tuple[tuple[str, str], ...]:
         else:
             text = f"{_WORDS[name].lower()} {abs(value):.2f} m/s ({abs(value) / KNOT:.1f} kn)"
         start.append(f"{text} {side}".rstrip())
+    held = r.commands_at_start(band.trial)
+    if held is not None:
+        start.append(f"to set it up, hold {_command_words(held, design)} until she is steady")
     where = f"N {signed(band['x_n'].nominal[0])} m, E {signed(band['y_n'].nominal[0])} m"
     d = np.zeros(4)
     d[: min(4, r.d.size)] = r.d[:4]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.request.request import PreparedRequest
+from greybox.channels import CHANNELS
 from greybox.errors import UsageError
 
 Array = NDArray[np.float64]
@@ -27,6 +28,8 @@ class Steady:
     ----------
     unit : ndarray
         (S, nc) commands in unit coordinates.
+    commands : ndarray
+        (S, nc) the same in the log's unit, angles [rad].
     x : ndarray
         (S, nx) states [m/s, rad/s].
     diameter : ndarray
@@ -36,9 +39,26 @@ class Steady:
     """
 
     unit: Array
+    commands: Array
     x: Array
     diameter: Array
     unstable: int
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a trial begins, and the constant commands that hold the ship there.
+
+    Parameters
+    ----------
+    state : ndarray
+        (nx + 1,) states [m/s, rad/s] and heading [rad].
+    commands : ndarray or None
+        (nc,) in the log's unit, angles [rad]; None where none are known.
+    """
+
+    state: Array
+    commands: Array | None = None
 
 
 def steady_motions(request: PreparedRequest, start: Array | None = None) -> Steady:
@@ -72,7 +92,7 @@ def steady_motions(request: PreparedRequest, start: Array | None = None) -> Stea
     rate = np.abs(x[:, structure.states.index("r")]) if "r" in structure.states else 0 * speed
     with np.errstate(divide="ignore"):
         diameter = np.where(rate > 1e-6, 2 * speed / np.maximum(rate, 1e-12), np.inf)
-    return Steady(grid[good], x[good], diameter[good], int((~good).sum()))
+    return Steady(grid[good], values[good], x[good], diameter[good], int((~good).sum()))
 
 
 def parse_regime(text: str, states: tuple[str, ...]) -> Signs:
@@ -119,7 +139,7 @@ def steady_start(
     signs: Signs,
     margins: dict[str, float],
     caps: tuple[float | None, float | None] = (None, None),
-) -> Array | None:
+) -> Start | None:
     """Return a steady motion well inside a regime, with heading 0; None where none is.
 
     Of those a fifth beyond the margins and a tenth below the caps the one of the
@@ -129,11 +149,6 @@ def steady_start(
     ----------
     caps : (float, float)
         Largest speed [m/s] and rate of turn [rad/s], None where there is none.
-
-    Returns
-    -------
-    ndarray
-        (nx + 1,) states [m/s, rad/s] and heading [rad].
     """
     if not len(steady.x):
         return None
@@ -151,10 +166,30 @@ def steady_start(
     inside = below & (depth >= 1.2)
     if inside.any():
         best = int(np.where(inside, moderate, np.inf).argmin())
-        return np.append(steady.x[best], 0.0)
+        return Start(np.append(steady.x[best], 0.0), steady.commands[best])
     if below.any():
         depth = np.where(below, depth, -np.inf)
     best = int(depth.argmax())
     if depth[best] <= 0:
         return None
-    return np.append(steady.x[best], 0.0)
+    return Start(np.append(steady.x[best], 0.0), steady.commands[best])
+
+
+def state_words(states: tuple[str, ...], start: Array) -> str:
+    """Return initial states and heading (nx + 1,) with their units."""
+    # what rounding leaves of zero is no motion
+    return ", ".join(
+        f"{n} {round(float(x), 4) + 0.0:.3g} {CHANNELS[n].unit}"
+        for n, x in zip((*states, "psi"), start, strict=True)
+    )
+
+
+def start_words(request: PreparedRequest, trial: int) -> str:
+    """Return the start of a trial, and the commands that hold the ship there, where known."""
+    said = state_words(request.structure.states, request.starts[trial])
+    held = request.commands_at_start(trial)
+    if held is None:
+        return said
+    angles = request.vessel.angle_commands
+    shown = ", ".join(f"{n} {x:.4g}{' rad' if n in angles else ''}" for n, x in held.items())
+    return f"{said}, held by {shown}"

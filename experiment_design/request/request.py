@@ -207,6 +207,7 @@ class LeadIn:
         return replace(
             request,
             starts=(self.end,),
+            start_commands=(),
             limits=replace(request.limits, position=self.place),
             lead_in=self,
         )
@@ -234,6 +235,9 @@ class PreparedRequest(TrialOptions):
         Signs that the states keep, one entry a trial, such as ``(("u", 1), ("v", 1))``.
     starts : tuple of ndarray
         (nx + 1,) initial states and heading a trial [m/s, rad/s, rad].
+    start_commands : tuple of ndarray or None
+        (nc,) constant commands a trial under which its start is a steady motion, None where none
+        are known; empty where none are of any.
     predictor : str
         ``basic``, ``augmented``, ``wind`` or ``basic+wind``.
     targets : tuple of float
@@ -275,6 +279,7 @@ class PreparedRequest(TrialOptions):
     regimes: tuple[Signs, ...]
     starts: tuple[Array, ...]
     predictor: str = "augmented"
+    start_commands: tuple[Array | None, ...] = ()
     targets: tuple[float, ...] = ()
     d: Array = field(default_factory=lambda: np.zeros(4))
     gust: float = 0.0
@@ -322,6 +327,13 @@ class PreparedRequest(TrialOptions):
             limits=replace(self.limits, position=lead.position),
             lead_in=None,
         )
+
+    def commands_at_start(self, trial: int) -> dict[str, float] | None:
+        """Return the constant commands that hold the ship at a trial's start, None if unknown."""
+        held = self.start_commands[trial] if self.start_commands else None
+        if held is None:
+            return None
+        return dict(zip(self.schedule.commands, held.tolist(), strict=True))
 
     @property
     def lead_in_samples(self) -> int:

@@ -127,6 +127,23 @@ def test_steady_starts_keep_the_caps():
     assert abs(r) <= 0.05
 
 
+def test_a_steady_start_names_the_commands_that_hold_it():
+    request = prepare_request(thesis_model(), DesignRequest(150.0, regime="u+v+"))
+    (held,) = request.start_commands
+    assert request.commands_at_start(0) == dict(zip(request.schedule.commands, held, strict=True))
+    rollout = build_problem(request).scenarios[0].rollout
+    states = rollout.run(np.tile(held, (1, 200, 1))).state[0, :, :3]
+    np.testing.assert_allclose(states, np.tile(request.starts[0][:3], (201, 1)), atol=1e-6)
+    u, v, r, _ = request.starts[0]
+    (note,) = [n for n in request.notes if "steady motion" in n]
+    assert f"u {u:.3g} m/s, v {v:.3g} m/s, r {r:.3g} rad/s, psi 0 rad" in note
+    assert f"psi 0 rad, held by n {held[0]:.4g}, alpha1 {held[1]:.4g} rad" in note
+    given = prepare_request(
+        thesis_model(), DesignRequest(150.0, regime="u+v+", start=(1.5, 1.2, 0.0, 0.0))
+    )
+    assert given.commands_at_start(0) is None
+
+
 def test_a_locked_thruster_has_equal_limits():
     request = make_request(
         structure="surge", vessel=limited_ship(angles=(0.8, 0.8)), effort=0.05, duration=150.0

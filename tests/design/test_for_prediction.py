@@ -352,6 +352,10 @@ def test_the_command(files, capsys: pytest.CaptureFixture[str]) -> None:
     told = json.loads(capsys.readouterr().out)
     assert told["prediction"]["random_error_over_this"] > 1
     assert plan.read_text().startswith("t,")
+    (held,) = told["start_commands"]
+    (note,) = [n for n in told["notes"] if "steady motion" in n]
+    name, level = next(iter(held.items()))
+    assert f"rad/s, psi 0 rad, held by {name} {level:.4g}" in note
 
 
 @pytest.mark.parametrize(

@@ -203,6 +203,19 @@ def test_draws_that_the_misfit_throws_out_of_every_bound_are_lost(known):
     np.testing.assert_allclose(band["r"].high, band["r"].nominal, atol=1e-6)
 
 
+def test_a_steady_start_is_told_with_its_commands(known):
+    (band,) = predict_motion(known)
+    held = np.array([15.0, np.deg2rad(40.0), np.deg2rad(50.0)])
+    steady = replace(known, request=replace(known.request, start_commands=(held,)))
+    start = dict(sheet_contents(steady, band).facts)["Start"]
+    set_up = "to set it up, hold n 15.0, alpha1 starboard 40°, alpha2 starboard 50° until she is"
+    assert start.endswith(f"{set_up} steady")
+    (told,) = steady.to_dict()["start_commands"]
+    assert told == dict(zip(known.request.schedule.commands, held, strict=True))
+    assert "hold" not in dict(sheet_contents(known, band).facts)["Start"]
+    assert known.to_dict()["start_commands"] == [None]
+
+
 def test_wind_is_named_by_where_it_comes_from(known):
     design = replace(known, request=replace(known.request, d=np.array([0, 0, -5.0, 0])))
     (band,) = predict_motion(known)
