@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,12 @@ from greybox.diagnosis import causes
 from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.errors import UsageError
-from greybox.model.catalogue import get_structure
+from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.run.simulation import simulate
 from greybox.study.chapter6 import TRUE
 from greybox.study.inputs import smoothed_pulses
 from greybox.trial.log import make_log
+from greybox.vessel.force import force_inputs
 from greybox.vessel.toml import load_vessel, vessel_from_dict
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "causes.md").read_text(encoding="utf-8")
@@ -143,3 +144,48 @@ def test_forces_that_no_thruster_makes_are_not_lacking():
         context = Context(get_structure("linear"), vessel, ("u", "v", "r"), False, 900.0, 1.0, {})
         assert ("N_tauy" in context.lacking("N_tauy", "Y_taun")) == lacks
         assert "Y_taun" in context.lacking("N_tauy", "Y_taun")
+
+
+@pytest.mark.parametrize("kind", ["propeller_rudder", "azimuth"])
+def test_thrusters_that_follow_the_same_columns_are_hypotheses_of_their_own(kind):
+    angle = "rudder" if kind == "propeller_rudder" else "angle"
+    twins = [{"type": kind, "x": -28.0, "y": y, "speed": "n", angle: "delta"} for y in (4.0, -4.0)]
+    vessel = vessel_from_dict({"name": "twin", "length": 60.0, "thruster": twins})
+    structure = structure_for("thesis", force_inputs(vessel))
+    context = Context(
+        structure, vessel, ("u", "v", "r", "psi"), False, 1000.0, 1.0, {"n": 10.0}, False,
+        {"n": 5.0, "delta": 0.5}, {"n": 1.0, "delta": 0.1},
+    )  # fmt: skip
+    for cause in known_causes().values():
+        keys = [h.key for h in cause.hypotheses(context)]
+        assert len(keys) == len(set(keys)), cause.id
+
+
+def test_the_null_of_a_lag_or_delay_is_the_vessels_own():
+    """A lag that the vessel states and the logs do not show is as wrong as one that it lacks."""
+    vessel = load_vessel("thesis")
+    vessel = replace(vessel, actuation=replace(vessel.actuation, lag=5.0, delay=3.0))
+    context = Context(
+        get_structure("thesis"), vessel, ("u", "v", "r", "psi"), False, 1000.0, 1.0, {"n": 10.0},
+        False, {"n": 5.0, "alpha1": 0.5, "alpha2": 0.5}, {"n": 1.0, "alpha1": 0.1, "alpha2": 0.1},
+    )  # fmt: skip
+    for cause, key, own in (
+        ("thruster_lag", "thruster_lag:force", 5.0), ("input_delay", "input_delay", 3.0),
+    ):  # fmt: skip
+        (found,) = (h for h in known_causes()[cause].hypotheses(context) if h.key == key)
+        (parameter,) = found.parameters
+        begun = [parameter.start, *(s[0] for s in found.starts)]
+        assert parameter.null == own
+        assert min(begun) < own < max(begun)
+
+
+def test_columns_that_were_exchanged_are_told_by_their_names() -> None:
+    side = [
+        {"type": "tunnel", "x": x, "speed": f"n_{end}"} for end, x in (("bow", 4), ("stern", -4))
+    ]
+    vessel = vessel_from_dict({"name": "ship", "length": 10.0, "thruster": side})
+    context = Context(get_structure("linear"), vessel, ("u", "v", "r"), False, 900.0, 1.0, {})
+    sign = known_causes()["sign"]
+    (swap,) = (h for h in sign.hypotheses(context) if h.key.startswith("sign:swapped"))
+    told = sign.evidence_of(swap, {"swapped_n_bow_n_stern": (-1.0, 0.0)})
+    assert told == "n_bow and n_stern stand in each other's place"

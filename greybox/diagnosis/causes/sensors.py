@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,12 +153,17 @@ class Sign(Cause):
                     out.append(_wired(self.id, f"swapped_{one}_{two}", swap))
         return out
 
+    def evidence_of(self, hypothesis: Hypothesis, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say which, or which two."""
+        if isinstance(hypothesis.apply, _Wires) and len(hypothesis.apply.wires) > 1:
+            # names of columns may hold what joins them in that of the parameter
+            pair = " and ".join(command for command, _, _ in hypothesis.apply.wires)
+            return f"{pair} stand in each other's place"
+        return self.evidence(values)
+
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say which."""
         name = next(iter(values))
-        if name.startswith("swapped_"):
-            pair = name.removeprefix("swapped_").replace("_", " and ")
-            return f"{pair} stand in each other's place"
         return f"{name.removeprefix('sign_')} has the opposite sign of what the motion shows"
 
 
@@ -170,8 +175,15 @@ def _reversed(cause: str, name: str) -> Hypothesis:
     return Hypothesis(cause, f"{cause}:sign_{name}", (), (), apply, refit_from_scratch=True)
 
 
-def _wired(cause: str, key: str, wires: tuple[Wire, ...]) -> Hypothesis:
-    def apply(ship: Ship, value: Array) -> Ship:
-        return replace(ship, wires=(*ship.wires, *wires))
+@dataclass(frozen=True)
+class _Wires:
+    """Makes columns stand for others on a ship."""
 
-    return Hypothesis(cause, f"{cause}:{key}", (), (), apply, refit_from_scratch=True)
+    wires: tuple[Wire, ...]
+
+    def __call__(self, ship: Ship, value: Array) -> Ship:
+        return replace(ship, wires=(*ship.wires, *self.wires))
+
+
+def _wired(cause: str, key: str, wires: tuple[Wire, ...]) -> Hypothesis:
+    return Hypothesis(cause, f"{cause}:{key}", (), (), _Wires(wires), refit_from_scratch=True)
