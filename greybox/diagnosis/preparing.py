@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from greybox.diagnosis.causes import Cause, Context, known_causes
 from greybox.diagnosis.evidence.kinematics import decided, denied, judged_by_kinematics, mended
@@ -24,6 +25,8 @@ from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import whole_name
 from greybox.vessel.force import force_inputs
+
+Array = NDArray[np.float64]
 
 # samples that a diagnosis needs in every log
 SHORTEST = 120
@@ -135,7 +138,7 @@ def prepare(
     validate = [correct_log(log, vessel) for log in validate]
     start = _structure(structure, logs, model)
     require_motion(logs, start)
-    context = _context(start, [*logs, *validate], model)
+    context = _context(start, logs, validate, model)
     # of a clock of one channel the kinematics tell all; an arm or a bias may be shared by all
     told = decided(findings) | {a for a in kinematics.agreeing if a.startswith("clock_offset:")}
     known = [a for c in causes.values() for a in c.hypotheses(context)]
@@ -198,13 +201,18 @@ def _structure(name: str, logs: Sequence[TrialLog], model: ManoeuvringModel | No
 
 def context_of(structure: Structure, ready: Prepared) -> Context:
     """Return what causes are told of a prepared case, with another structure."""
-    return _context(structure, [*ready.case.logs, *ready.case.held_out_logs], ready.model)
+    return _context(structure, ready.case.logs, ready.case.held_out_logs, ready.model)
 
 
 def _context(
-    structure: Structure, logs: Sequence[TrialLog], model: ManoeuvringModel | None
+    structure: Structure,
+    logs: Sequence[TrialLog],
+    validate: Sequence[TrialLog],
+    model: ManoeuvringModel | None,
 ) -> Context:
     first = logs[0]
+    speeds = {t.speed: _turning([log[t.speed] for log in logs]) for t in first.vessel.thrusters}
+    logs = [*logs, *validate]
     moved = {c: [log[c] for log in logs] for c in first.vessel.commands}
     turns = "r" in structure.states and all("psi" in log for log in logs)
     return Context(
@@ -214,7 +222,7 @@ def _context(
         has_wind=all(log.has_wind for log in logs),
         duration=min(float(log.t[-1] - log.t[0]) for log in logs),
         sample_time=first.sample_time,
-        speeds={t.speed: float(np.median(np.abs(first[t.speed]))) for t in first.vessel.thrusters},
+        speeds=speeds,
         current_known=model is not None and any(model.d[:2]),
         ranges={c: max(float(np.ptp(x)) for x in v) for c, v in moved.items()},
         fastest={
@@ -222,6 +230,12 @@ def _context(
             for c, v in moved.items()
         },
     )
+
+
+def _turning(speeds: Sequence[Array]) -> float:
+    """Return the typical size of a propeller speed, of all samples (N,) in which it turns."""
+    sizes = np.abs(np.concatenate(speeds))
+    return float(np.median(sizes[sizes > 0])) if sizes.any() else 0.0
 
 
 def _case(
