@@ -296,11 +296,14 @@ class DiagnosisBuilder:
         first = self.found.base if first is None else first
         logs = list(validate)
         if logs:
-            after = _likelier_story(after, logs)
+            later = _likelier_story(after, logs)
             one = [run_on(before, log) for log in logs]
-            two = [self._as_seen(run_on(after, log), log) for log in logs]
+            two = [self._as_seen(run_on(later, log), log, final) for log in logs]
         else:
-            one = held_runs(self.case.held_out(first.integrator).pairs(first))
+            later, pairs = after, self.case.held_out(first.integrator).pairs(first)
+            one = held_runs(pairs)
+            if before is self.given:
+                one = [run_on(before, run.log) for pair in pairs for run in pair.held.runs]
             two = held_runs(self.case.held_out(final.integrator).pairs(final))
         runs = [
             Runs(
@@ -316,18 +319,18 @@ class DiagnosisBuilder:
             )
             for a, b in zip(ones, twos, strict=True)
         ]  # fmt: skip
-        return gains(one, two, self.case.logs[0].sample_time, self.seed), runs, after
+        return gains(one, two, self.case.logs[0].sample_time, self.seed), runs, later
 
-    def _as_seen(self, run: LogFit, log: TrialLog) -> LogFit:
+    def _as_seen(self, run: LogFit, log: TrialLog, final: Fit) -> LogFit:
         """Return a run as sensors away from the origin show it, beside the log as it is.
 
         A log that is carried to the origin has the noise of the yaw rate, times the lever,
         in its velocities; a run that is carried to the sensors has none.
         """
-        sensors = self.found.final.point.ship.sensors
+        sensors = final.point.ship.sensors
         if not any(sensors.lever) or len(run.log) != len(log):
             return run
-        seen = self.case.problem(self.found.final.integrator).runs[0]
+        seen = self.case.problem(final.integrator).runs[0]
         outputs = np.column_stack([run.x, run.psi])[:, : len(seen.outputs)]
         x = seen.sense(sensors, outputs[..., None])[:, : len(seen.states), 0]
         return replace(run, log=log, x=x, fit=fit_on(log, seen.states, x))

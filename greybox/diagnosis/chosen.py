@@ -69,6 +69,10 @@ def from_chosen(
     late = _late(ready.case, found)
     ready = replace(ready, case=ready.case.acting(found.final.point.ship.vessel)) if late else ready
     choice = choice_of(ready.case.logs) if late else begun()
+    states = ready.case.structure.states
+    if choice is not None and not set(choice.terms.structure.states) <= set(states):
+        # the terms of motions that this structure leaves out are none of it
+        choice = None
     terms = () if choice is None else choice.terms.structure.parameters
     case = ready.case.wider(terms, "free run")
     base = case.carried(found.base)

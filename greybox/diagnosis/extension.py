@@ -83,6 +83,9 @@ def extended_model(
             i = where[name]
             disturbances[name] = (float(ship.current[k]), float(np.sqrt(covariance[i, i])))
     names = problem.structure.parameters
+    means = [where[n] for n in disturbances] if set(disturbances) <= set(where) else []
+    beside = np.array([np.zeros(len(covariance)) if i is None else covariance[i] for i in index])
+    shared = np.vstack([beside, covariance[means]])[:, means]
     # levels of noise are those of the errors' colour, whatever the fit was weighed by
     white = problem.forgetful(fit, np.inf)
     summed = {
@@ -97,6 +100,7 @@ def extended_model(
         vessel=extended_vessel(ship.vessel, ship.sensors, ship.wires, logs[0]),
         integrator=fit.integrator,
         disturbances=disturbances,
+        disturbance_covariance=shared if means else np.zeros((0, 0)),
         residual_std=one_step_deviations(problem, white),
         noise=noise_levels(problem, white),
         sums=summed,

@@ -11,7 +11,7 @@ from greybox.diagnosis.result import Gain
 from greybox.model.model import ManoeuvringModel
 from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
-from greybox.validation.fit import LogFit, run_model
+from greybox.validation.fit import LogFit, by_log, run_model
 
 Array = NDArray[np.float64]
 
@@ -48,14 +48,18 @@ def gains(
     for i, state in enumerate(before[0].fit):
         draws = np.zeros((2, _DRAWS))
         point = np.zeros(2)
-        for one, two in zip(before, after, strict=True):
-            size = min(len(one.log), len(two.log))
-            parts = [_squares(run, i, state, size) for run in (one, two)]
-            start, length = blocks(size, sample_time, _DRAWS, rng)
+        # segments between the gaps of one log count as one
+        whole = by_log(before)
+        rest = iter(after)
+        for ones in whole:
+            twos = [next(rest) for _ in ones]
+            sizes = [min(len(a.log), len(b.log)) for a, b in zip(ones, twos, strict=True)]
+            parts = [_squares(runs, i, state, sizes) for runs in (ones, twos)]
+            start, length = blocks(sum(sizes), sample_time, _DRAWS, rng)
             for k, (error, spread) in enumerate(parts):
                 e, s = (block_sums(v, start, length) for v in (error, spread))
-                draws[k] += _fit(e, s) / len(before)
-                point[k] += float(_fit(error.sum(), spread.sum())) / len(before)
+                draws[k] += _fit(e, s) / len(whole)
+                point[k] += float(_fit(error.sum(), spread.sum())) / len(whole)
         low, high = np.quantile(draws[1] - draws[0], [0.025, 0.975])
         out[state] = Gain(float(point[0]), float(point[1]), (float(low), float(high)))
     return out
@@ -86,11 +90,22 @@ def _fit(error: Array | float, spread: Array | float) -> Array:
         return np.asarray(100 * (1 - np.sqrt(error / np.maximum(spread, 1e-300))))
 
 
-def _squares(run: LogFit, i: int, state: str, size: int) -> tuple[Array, Array]:
-    measured, known = run.log[state][:size], run.log.known((state,))[:size]
+def _squares(
+    runs: Sequence[LogFit], i: int, state: str, sizes: Sequence[int]
+) -> tuple[Array, Array]:
+    measured, simulated, known = (
+        np.concatenate(parts)
+        for parts in zip(
+            *(
+                (run.log[state][:n], run.x[:n, i], run.log.known((state,))[:n])
+                for run, n in zip(runs, sizes, strict=True)
+            ),
+            strict=True,
+        )
+    )
     # where nothing was measured, nothing counts
     spread = (measured - measured[known].mean()) ** 2 * known
     with np.errstate(over="ignore", invalid="ignore"):
-        error = (measured - run.x[:size, i]) ** 2 * known
+        error = (measured - simulated) ** 2 * known
     worst = _WORST**2 * max(float(spread.mean()), 1e-300)
     return np.minimum(np.nan_to_num(error, nan=worst, posinf=worst), worst), spread

@@ -230,16 +230,18 @@ def search(
     causes: list[Candidate] = list(begun)
     most += len(causes)
     known: set[frozenset[str]] = set()
+    # those that are left out on the way were tried, too
+    tried = len(hypotheses)
     while len(causes) < most and frozenset(c.hypothesis.key for c in causes) not in known:
         # causes that take each other's place would go round for ever
         known.add(frozenset(c.hypothesis.key for c in causes))
-        step = take_step(case, fit, causes, hypotheses)
+        step = take_step(case, fit, causes, hypotheses, tried - len(hypotheses))
         steps.append(step)
         _told(steps, progress)
         if step.taken is None:
             break
         left = not alone and _left_to_motion(case, fit)
-        fit, causes = _with(case, causes, step.taken, len(hypotheses))
+        fit, causes = _with(case, causes, step.taken, tried)
         if left and _left_to_motion(case, fit):
             more = _completed(case, fit, causes, hypotheses) if len(causes) < most else None
             if more is not None:
@@ -252,7 +254,7 @@ def search(
             hypotheses = [h for h in hypotheses if h.past]
             if not hypotheses:
                 break
-    return Search(base, fit, tuple(steps), tuple(causes), len(hypotheses))
+    return Search(base, fit, tuple(steps), tuple(causes), tried)
 
 
 def _told(steps: Sequence[Step], progress: Callable[[str], None]) -> None:
@@ -285,7 +287,8 @@ def _completed(
 ) -> tuple[Step, Fit, list[Candidate]] | None:
     """Return the step to a second cause that leaves nothing to motion and commands, if one does."""
     tried = len(hypotheses)
-    second = take_step(case, fit, causes, [h for h in hypotheses if not h.past], tried)
+    present = [h for h in hypotheses if not h.past]
+    second = take_step(case, fit, causes, present, tried - len(present))
     if second.taken is None:
         return None
     fit, found = _with(case, causes, second.taken, tried)
@@ -305,11 +308,11 @@ def take_step(
     fit: Fit,
     causes: Sequence[Candidate],
     hypotheses: Sequence[Hypothesis],
-    tried: int = 0,
+    passed_over: int = 0,
 ) -> Step:
     """Score what is left, refit the best, and take the likeliest if it holds.
 
-    `tried` hypotheses count where more than those given are.
+    As many more than those given were tried as were passed over.
     """
     left = [a for a in hypotheses if not _taken(a, causes)]
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
@@ -323,7 +326,7 @@ def take_step(
         fits += [(hypothesis, found, held_out.prove(fit, found)) for hypothesis, found in again]
     candidates = sorted(
         (
-            assess_candidate(proof, fit, found, hypothesis, max(tried, len(left)), problem.names)
+            assess_candidate(proof, fit, found, hypothesis, len(left) + passed_over, problem.names)
             for hypothesis, found, proof in fits
         ),
         key=_bic,

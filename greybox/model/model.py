@@ -147,7 +147,16 @@ class ManoeuvringModel(DisplayMixin):
             return self
         now = factors_at(self.changes, self.names, np.inf)
         covariance = self.covariance * np.outer(now, now)
-        return replace(self, theta=self.theta * now, covariance=covariance, changes=())
+        shared = self.disturbance_covariance
+        if shared.size:
+            shared = shared * np.append(now, np.ones(len(shared) - len(now)))[:, None]
+        return replace(
+            self,
+            theta=self.theta * now,
+            covariance=covariance,
+            disturbance_covariance=shared,
+            changes=(),
+        )
 
     def estimable(self) -> ManoeuvringModel:
         """Return the model of the terms that a regression can find; nothing else changes."""

@@ -226,6 +226,11 @@ class Term:
         return "·".join([self.name, *map(str, self.factors)])
 
 
+def mirror_sign(signal: str) -> int:
+    """Return the sign that a signal has when port and starboard change places."""
+    return -1 if signal in _TURNED else 1
+
+
 def _term(name: str, equation: str, *factors: str) -> Term:
     return Term(
         name,

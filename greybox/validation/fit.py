@@ -326,13 +326,13 @@ def average_fit(fits: Sequence[LogFit]) -> dict[str, float]:
 
     Segments between the gaps of one log count as one.
     """
-    groups = _by_log(fits)
+    groups = by_log(fits)
     whole = [_joined(runs) for runs in groups]
     samples = [sum(len(r.log) for r in runs) for runs in groups]
     return {s: float(np.average([fit[s] for fit in whole], weights=samples)) for s in whole[0]}
 
 
-def _by_log(fits: Sequence[LogFit]) -> list[list[LogFit]]:
+def by_log(fits: Sequence[LogFit]) -> list[list[LogFit]]:
     """Group the runs on neighbouring segments of one log."""
     groups: list[list[LogFit]] = []
     for run in fits:

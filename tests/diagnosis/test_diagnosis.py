@@ -68,6 +68,11 @@ def test_command_writes_what_the_contract_says(written: Path, capsys) -> None:
     for name, (value, std) in model.disturbances.items():
         assert value == cause["parameters"][name]["value"]
         assert std == pytest.approx(cause["parameters"][name]["std"], rel=1e-6)
+    shared = np.array(model.disturbance_covariance)
+    assert shared.shape == (len(model.names) + 2, 2)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(shared[-2:])), [std for _, std in model.disturbances.values()]
+    )
     # the extended model is an ordinary one: compare gives the same fit
     assert main(["compare", str(written / "m.json"), "--log", at[2], "--json", str(written / "c"),
                  "--no-bands"]) == 0  # fmt: skip

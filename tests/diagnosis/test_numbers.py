@@ -7,15 +7,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from designs import thesis_model
+from virtual import virtual_log
 
 from greybox.diagnosis.causes import known_causes
 from greybox.diagnosis.evidence.held_out import proof_of
+from greybox.diagnosis.gain import gains
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import context_of, prepare
 from greybox.diagnosis.result import Found, Quantity
-from greybox.diagnosis.search import freed
-from greybox.model.terms import parse_term
+from greybox.diagnosis.search import freed, search
+from greybox.model.terms import mirror_sign, parse_term
 from greybox.study.blind import draw
+from greybox.trial.segments import join_segments, split_segments
+from greybox.validation.fit import average_fit, run_model
 
 
 @pytest.fixture(scope="module")
@@ -118,3 +123,32 @@ def test_a_cubic_force_that_drives_is_not_called_damping(ready) -> None:
 )  # fmt: skip
 def test_what_stays_when_port_and_starboard_change_places(name: str, even: bool) -> None:
     assert parse_term(name).even is even
+
+
+def test_signals_and_terms_have_one_mirror() -> None:
+    for signal in ("u", "v", "r", "uq", "vq", "uc", "vc", "taux", "tauy", "taun",
+                   "race_drag", "rudder_drag", "race", "rudder"):  # fmt: skip
+        assert (mirror_sign(signal) == 1) == parse_term(f"X_{signal}").even
+
+
+def test_the_gain_is_the_fit_of_whole_logs_whatever_their_gaps() -> None:
+    log = virtual_log(5, 400)
+    model = thesis_model()
+    gap = join_segments([log.window(0, 150, "log"), log.window(190, 400, "log")], "log")
+    worse = replace(model, theta=1.2 * model.theta)
+    before, after = ([run_model(m, p) for p in split_segments(gap)] for m in (worse, model))
+    found = gains(before, after, 1.0, 0)
+    for runs, told in ((before, "before"), (after, "after")):
+        whole = average_fit(runs)
+        for state, gain in found.items():
+            assert getattr(gain, told) == pytest.approx(whole[state], abs=1e-9)
+
+
+def test_all_causes_count_as_tried_though_only_some_are_left() -> None:
+    trial = draw(np.random.default_rng([31, 0]), ("quadratic_yaw_damping", "current"), samples=600)
+    ready = prepare(
+        [trial.estimation], [trial.validation], None, "thesis", ["current", "side_force"]
+    )
+    found = search(ready.case, ready.base(), ready.hypotheses, alone=False)
+    assert found.causes
+    assert found.tried == len(ready.hypotheses)

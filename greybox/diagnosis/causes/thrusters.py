@@ -115,9 +115,12 @@ class ThrusterGain(Cause):
             )  # fmt: skip
 
         out = []
-        for i, t in enumerate(thrusters):
+        columns = [(t.speed, t.steered_by) for t in thrusters]
+        for i, (speed, angle) in enumerate(columns):
             most = _STRONGEST if [i] in groups and len(groups) > 1 else 1.0
-            out.append(gain([i], f"{t.speed}:{t.steered_by or i}", most))
+            # two thrusters may follow the same columns
+            alone = angle if columns.count((speed, angle)) == 1 else None
+            out.append(gain([i], f"{speed}:{alone or i}", most))
         several = [g for g in groups if len(g) > 1]
         if len(groups) < 3:
             # of two groups the strength of one says that of the other
@@ -131,6 +134,11 @@ class ThrusterGain(Cause):
             f"the thruster driven by {name.removeprefix('gain_')} gives {100 * value:.0f} % of "
             f"the force that the model of the other thrusters predicts for it"
         )
+
+
+def _times(own: float, first: float, multiples: Sequence[int]) -> tuple[float, ...]:
+    """Return times at which the search for one begins: on both sides of the vessel's own."""
+    return (own / 2, 2 * own, first) if own else (first, *(m * first for m in multiples))
 
 
 class ThrusterLag(Cause):
@@ -147,18 +155,22 @@ class ThrusterLag(Cause):
         """Return a lag of the forces, the speeds, the angles, all commands, or one of them."""
         longest = min(_LONGEST, _SHARE * context.duration)
         first = 2 * context.sample_time
-        parameter = Parameter(
-            "lag", "s", first, 1e-3, longest, step=1e-3, least=UNRESOLVED * context.sample_time
-        )
-
+        actuation = context.vessel.actuation
         words = _together(context, get_args(LagOn))
 
         def lag(on: str, held: LagHeld, variants: tuple[Hypothesis, ...] = ()) -> Hypothesis:
             def apply(ship: Ship, value: Array) -> Ship:
                 return with_actuation(ship, lag=float(value[0]), lag_on=on, lag_held=held)
 
+            own = actuation.lag if on == actuation.lag_on else 0.0
+            start, *others = _times(own, first, (4,))
+            parameter = Parameter(
+                "lag", "s", start, 1e-3, longest, own, step=1e-3,
+                least=UNRESOLVED * context.sample_time,
+            )  # fmt: skip
             return Hypothesis(
-                self.id, f"{self.id}:{on}", (parameter,), (), apply, ((4 * first,),), variants,
+                self.id, f"{self.id}:{on}", (parameter,), (), apply,
+                tuple((t,) for t in others), variants,
                 place="" if on in words else on, past=True,
             )  # fmt: skip
 
@@ -201,11 +213,7 @@ class InputDelay(Cause):
         # held or moving on between samples, the same commands act half a sample apart, and where
         # they may be measured nothing tells which: that half, evenly spread
         coarse = _HALF * context.sample_time if _may_be_measured(context) else 0.0
-        parameter = Parameter(
-            "delay", "s", first, 0.0, longest, step=0.1 * context.sample_time,
-            least=UNRESOLVED * context.sample_time, coarse=coarse,
-        )  # fmt: skip
-
+        actuation = context.vessel.actuation
         words: tuple[str, ...] = get_args(DelayOn)
 
         def delay(on: str) -> Hypothesis:
@@ -213,8 +221,14 @@ class InputDelay(Cause):
                 return with_actuation(ship, delay=float(value[0]), delay_on=on)
 
             key = self.id if on == "command" else f"{self.id}:{on}"
+            own = actuation.delay if on == actuation.delay_on else 0.0
+            start, *others = _times(own, first, (3, 6))
+            parameter = Parameter(
+                "delay", "s", start, 0.0, longest, own, step=0.1 * context.sample_time,
+                least=UNRESOLVED * context.sample_time, coarse=coarse,
+            )  # fmt: skip
             return Hypothesis(
-                self.id, key, (parameter,), (), apply, starts=((3 * first,), (6 * first,)),
+                self.id, key, (parameter,), (), apply, starts=tuple((t,) for t in others),
                 place="" if on in words else on, past=True,
             )  # fmt: skip
 

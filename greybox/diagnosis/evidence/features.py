@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import LogRun, shifted, wired
+from greybox.model.terms import mirror_sign
 from greybox.rotation import ned_to_body
 from greybox.vessel.vessel import Thruster, Vessel
 
@@ -91,7 +92,7 @@ def features(run: LogRun, fit: Fit, start: Array, knots: Array) -> Features:
     names = run.states
     add(np.ones(len(x)), 1)
     states = list(x.T)
-    own_signs = [parity(name) for name in names]
+    own_signs = [mirror_sign(name) for name in names]
     for i, one in enumerate(states):
         add(one, own_signs[i], names[i])
         for j, two in enumerate(states[i:], i):
@@ -122,10 +123,10 @@ def features(run: LogRun, fit: Fit, start: Array, knots: Array) -> Features:
     for span, image in zip(spans, mirrored, strict=True):
         if image is not None:
             images |= zip(span, spans[image], strict=True)
-    forces = [parity(name) for name in run.structure.inputs]
+    forces = [mirror_sign(name) for name in run.structure.inputs]
     for force, sign in zip(tau.T, forces, strict=True):
         for name, state in zip(names, states, strict=True):
-            add(force * state, sign * parity(name), name, *commands)
+            add(force * state, sign * mirror_sign(name), name, *commands)
         for lag in _LAGS:
             add(shifted(force, lag / run.sample_time), sign, PAST)
     psi = log["psi"] if "psi" in log else np.zeros(len(x))
@@ -141,11 +142,6 @@ def features(run: LogRun, fit: Fit, start: Array, knots: Array) -> Features:
         np.column_stack(columns), tuple(arguments), np.array(signs, float),
         np.array([images.get(k, k) for k in range(len(columns))]),
     )  # fmt: skip
-
-
-def parity(signal: str) -> int:
-    """Return the sign that a motion or force has in the mirror of port and starboard."""
-    return 1 if signal in ("u", "taux") else -1
 
 
 def _across(thruster: Thruster) -> bool:

@@ -27,12 +27,12 @@ from greybox.diagnosis.evidence.features import (
     Features,
     features,
     knots_of,
-    parity,
 )
 from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.linear import NOWHERE
 from greybox.diagnosis.point import Fit
+from greybox.model.terms import mirror_sign
 from greybox.numerics.lagged_moments import correlation_factor
 from greybox.numerics.linalg import tall_svd
 from greybox.numerics.recursion import propagate
@@ -242,7 +242,7 @@ class _Pushers:
         place = {column: at for at, column in enumerate(columns)}
         images = [place.get((i, int(made[0].images[k])), -1) for i, k in columns]
         signs = [
-            parity(states[i]) * made[0].signs[k] if image >= 0 else 0.0
+            mirror_sign(states[i]) * made[0].signs[k] if image >= 0 else 0.0
             for (i, k), image in zip(columns, images, strict=True)
         ]
         images = [at if image < 0 else image for at, image in enumerate(images)]

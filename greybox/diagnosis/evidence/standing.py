@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.evidence.features import parity
 from greybox.diagnosis.evidence.held_out import Pair, Proof, proof_of
 from greybox.diagnosis.evidence.remainder import (
     MOTION_AND_COMMANDS,
@@ -29,7 +28,7 @@ from greybox.diagnosis.thresholds import (
     SAME,
     SIGNIFICANT,
 )
-from greybox.model.terms import parse_term
+from greybox.model.terms import mirror_sign, parse_term
 
 Array = NDArray[np.float64]
 
@@ -221,10 +220,10 @@ def _own_arguments(problem: Problem, hypothesis: Hypothesis) -> Use | None:
     for name in hypothesis.columns:
         term = parse_term(name)
         signals: set[str] = set()
-        sign = parity(term.state)
+        sign = mirror_sign(term.state)
         for factor in term.factors:
             # a bump on one side only has parts of both
-            sign *= 0 if factor.bump else 1 if factor.modulus else parity(factor.signal)
+            sign *= 0 if factor.bump else 1 if factor.modulus else mirror_sign(factor.signal)
             if factor.signal in known:
                 signals.add(factor.signal)
             elif factor.signal in problem.structure.inputs:
