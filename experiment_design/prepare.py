@@ -212,10 +212,12 @@ def prepare_request(
         starts=tuple(s.state if s.state is start else _clear_of_wind(s.state, base) for s in begun),
         start_commands=tuple(s.commands for s in begun),
     )
-    if start is None:
+    for trial, begin in enumerate(begun):
+        if begin.commands is None:
+            continue
+        which = f"trial {trial + 1}" if asked.trials > 1 else "the trial"
         of_regime.append(
-            f"the first trial starts from a steady motion: {start_words(base, 0)} "
-            f"(--start to change)"
+            f"{which} starts from a steady motion: {start_words(base, trial)} (--start to change)"
         )
         notes.append(of_regime[-1])
     return replace(base, notes=tuple(notes), of_regime=tuple(of_regime))

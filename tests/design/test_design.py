@@ -144,6 +144,14 @@ def test_a_steady_start_names_the_commands_that_hold_it():
     assert given.commands_at_start(0) is None
 
 
+def test_each_trial_tells_its_steady_start():
+    asked = DesignRequest(150.0, trials=2, regime="u+v+,u+v-", start=(1.5, 1.2, 0.0, 0.0))
+    request = prepare_request(replace(thesis_model(), vessel=limited_ship(angles=(-1, 1))), asked)
+    assert [held is None for held in request.start_commands] == [True, False]
+    (note,) = [n for n in request.notes if "steady motion" in n]
+    assert note.startswith("trial 2 starts from a steady motion: u ")
+
+
 def test_a_locked_thruster_has_equal_limits():
     request = make_request(
         structure="surge", vessel=limited_ship(angles=(0.8, 0.8)), effort=0.05, duration=150.0
