@@ -133,7 +133,7 @@ _TEMPLATE = """{% macro drawn(picture) %}{% set chart = chart_of(picture) %}
 {% endmacro %}
 {% macro numbers(of) %}
 {% for table in of.tables %}<div class="wide"><table
-{%- if table.sentences %} class="sentences"{% endif %}><caption>{{ table.caption }}</caption>
+{%- if table.sentences %} class="sentences"{% endif %}><caption><span>{{ table.caption }}</span></caption>
 <thead><tr>{% for cell in table.header %}<th scope="col">{{ cell }}</th>{% endfor %}</tr></thead>
 <tbody>{% for row in table.rows %}<tr>{% for cell in row %}<td
 {%- if table.sentences and 0 < loop.index0 < row | length - 1 %} data-name="
@@ -190,6 +190,8 @@ table.sentences th, table.sentences td { text-align: left; white-space: normal;
 table.sentences td:last-child { overflow-wrap: anywhere; }
 table.sentences td:first-child { max-width: 18rem; overflow-wrap: break-word; }
 caption { text-align: left; font-weight: 600; padding: 0.3rem 0; }
+caption span { display: inline-block; position: sticky; left: 0;
+               max-width: calc(100vw - 2rem); }
 pre { font-size: 0.8rem; overflow-x: auto; background: #f6f6f6; padding: 0.6rem; }
 pre.marked { white-space: pre-wrap; }
 ins { background: #cfe8fc; text-decoration: underline; font-weight: 600; }
