@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -26,6 +26,7 @@ from greybox.numerics.parallel import map_forked
 from greybox.regression.regression import build_regression
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.log import TrialLog
+from greybox.trial.segments import whole_name
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -46,6 +47,35 @@ FOLDS = 3
 _SHORTEST = 60
 
 
+# time of the first sample of the log that a segment is of, and how long that log is [s]
+Clock = tuple[float, float]
+
+
+def clocks_of(logs: Sequence[TrialLog]) -> list[Clock]:
+    """Return the clock that changes count on, of each log: that of the whole log of a segment."""
+    wholes: list[list[TrialLog]] = []
+    for log in logs:
+        before = wholes[-1][-1] if wholes else None
+        if before is not None and _follows(before, log):
+            wholes[-1].append(log)
+        else:
+            wholes.append([log])
+    return [
+        (float(parts[0].t[0]), float(parts[-1].t[-1] - parts[0].t[0]))
+        for parts in wholes
+        for _ in parts
+    ]
+
+
+def _follows(before: TrialLog, log: TrialLog) -> bool:
+    """Whether a log is a later segment of the one that another one is a segment of."""
+    return (
+        whole_name(before.name) == whole_name(log.name) != log.name
+        and before.provenance == log.provenance
+        and bool(before.t[-1] < log.t[0])
+    )
+
+
 class DiagnosisProblem:
     """Logs, a structure to diagnose, and a wider one that every cause fits in.
 
@@ -59,6 +89,8 @@ class DiagnosisProblem:
     regime : Regime
     metric : {"coloured", "free run"}
         See `Problem`.
+    clocks : tuple of sequence of Clock, optional
+        Of `logs` and of `held_out`, as `clocks_of` gives them.
     """
 
     def __init__(
@@ -70,10 +102,12 @@ class DiagnosisProblem:
         kind: str,
         regime: Regime,
         metric: Metric = "coloured",
+        clocks: tuple[Sequence[Clock], Sequence[Clock]] | None = None,
     ) -> None:
         self.structure, self.universe = structure, universe
         self.metric: Metric = metric
         self.logs, self.held_out_logs = list(logs), list(held_out)
+        self.clocks = clocks or (clocks_of(logs), clocks_of(held_out))
         self.kind, self.regime = kind, regime
         self._problems: dict[Integrator, Problem] = {}
         self._held: dict[Integrator, HeldOut] = {}
@@ -84,7 +118,7 @@ class DiagnosisProblem:
         more = [n for n in names if parse_term(n).key not in known]
         return DiagnosisProblem(
             self.structure, self.universe.with_terms(*more), self.logs, self.held_out_logs,
-            self.kind, self.regime, metric,
+            self.kind, self.regime, metric, self.clocks,
         )  # fmt: skip
 
     def acting(self, vessel: Vessel) -> DiagnosisProblem:
@@ -97,8 +131,9 @@ class DiagnosisProblem:
             for every in (self.logs, self.held_out_logs)
         )  # fmt: skip
         return DiagnosisProblem(
-            self.structure, self.universe, logs, held_out, self.kind, self.regime, self.metric
-        )
+            self.structure, self.universe, logs, held_out, self.kind, self.regime, self.metric,
+            self.clocks,
+        )  # fmt: skip
 
     def carried(self, fit: Fit) -> Fit:
         """Return a fit of a case with fewer terms as one of this."""
@@ -113,7 +148,9 @@ class DiagnosisProblem:
     def problem(self, integrator: Integrator) -> Problem:
         """Return the estimation logs, ready to be run."""
         if integrator not in self._problems:
-            self._problems[integrator] = self._made(self.logs, integrator)
+            self._problems[integrator] = self._made(
+                zip(self.logs, self.clocks[0], strict=True), integrator
+            )
         return self._problems[integrator]
 
     def held_out(self, integrator: Integrator) -> HeldOut:
@@ -121,46 +158,32 @@ class DiagnosisProblem:
         if integrator not in self._held:
             if self.held_out_logs:
                 self._held[integrator] = OtherLogs(
-                    self.problem(integrator), self._made(self.held_out_logs, integrator)
+                    self.problem(integrator),
+                    self._made(zip(self.held_out_logs, self.clocks[1], strict=True), integrator),
                 )
             else:
                 self._held[integrator] = Folds(self._folds(integrator))
         return self._held[integrator]
 
-    def _made(
-        self,
-        logs: Sequence[TrialLog],
-        integrator: Integrator,
-        origins: Sequence[float] | None = None,
-    ) -> Problem:
-        return Problem(
-            [
-                LogRun(self.universe, log, integrator, None if origins is None else origins[i])
-                for i, log in enumerate(logs)
-            ],
-            self.metric,
-        )
+    def _made(self, parts: Iterable[tuple[TrialLog, Clock]], integrator: Integrator) -> Problem:
+        runs = [LogRun(self.universe, log, integrator, *clock) for log, clock in parts]
+        return Problem(runs, self.metric)
 
     def _folds(self, integrator: Integrator) -> list[tuple[Problem, Problem]]:
         out = []
         for k in range(FOLDS):
-            fitting: list[tuple[TrialLog, float]] = []
-            held: list[tuple[TrialLog, float]] = []
-            for log in self.logs:
+            fitting: list[tuple[TrialLog, Clock]] = []
+            held: list[tuple[TrialLog, Clock]] = []
+            for log, clock in zip(self.logs, self.clocks[0], strict=True):
                 edges = np.linspace(0, len(log), FOLDS + 1).astype(int)
-                first = float(log.t[0])
-                held.append((log.window(int(edges[k]), int(edges[k + 1])), first))
+                held.append((log.window(int(edges[k]), int(edges[k + 1])), clock))
                 for a, b in ((0, int(edges[k])), (int(edges[k + 1]), len(log))):
                     if b - a >= _SHORTEST:
-                        fitting.append((log.window(a, b), first))
+                        fitting.append((log.window(a, b), clock))
             if not fitting:
                 # the middle of a short log leaves nothing long enough beside it
                 continue
-            made = [
-                self._made([part for part, _ in parts], integrator, [first for _, first in parts])
-                for parts in (fitting, held)
-            ]
-            out.append((made[0], made[1]))
+            out.append((self._made(fitting, integrator), self._made(held, integrator)))
         return out
 
     def base(self, coefficients: Mapping[str, float] | None, current: Array) -> Fit:

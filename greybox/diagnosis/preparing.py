@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.causes import Cause, Context, known_causes
 from greybox.diagnosis.evidence.kinematics import decided, denied, judged_by_kinematics, mended
 from greybox.diagnosis.hypothesis import Hypothesis
-from greybox.diagnosis.null_model import DiagnosisProblem
+from greybox.diagnosis.null_model import Clock, DiagnosisProblem, clocks_of
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import CURRENTS
 from greybox.errors import LogError, UsageError, suggestion
@@ -25,6 +25,7 @@ from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import whole_name
 from greybox.vessel.force import force_inputs
+from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
@@ -122,6 +123,11 @@ def prepare(
     """
     common_sample_time([*logs, *validate])
     short = [log.name for log in (*logs, *validate) if len(log) < SHORTEST]
+    # also the segments that are left out are of the log that a change counts in
+    clocks = [
+        [clock for log, clock in zip(every, clocks_of(every), strict=True) if len(log) >= SHORTEST]
+        for every in (logs, validate)
+    ]
     logs = _long_enough(logs)
     validate = _long_enough(validate) if validate else []
     causes = _chosen(ids)
@@ -134,16 +140,17 @@ def prepare(
     kinematics = judged_by_kinematics([correct_log(log, stated) for log in (*logs, *validate)])
     findings = [f for f in kinematics.findings if f.id in causes]
     vessel = mended(stated, findings)
-    logs = [correct_log(log, vessel) for log in logs]
-    validate = [correct_log(log, vessel) for log in validate]
+    logs, own = _corrected(logs, clocks[0], vessel)
+    validate, others = _corrected(validate, clocks[1], vessel)
     start = _structure(structure, logs, model)
     require_motion(logs, start)
-    context = _context(start, logs, validate, model)
+    duration = min(length for _, length in (*own, *others))
+    context = _context(start, logs, validate, duration, model)
     # of a clock of one channel the kinematics tell all; an arm or a bias may be shared by all
     told = decided(findings) | {a for a in kinematics.agreeing if a.startswith("clock_offset:")}
     known = [a for c in causes.values() for a in c.hypotheses(context)]
     hypotheses = [a for a in known if not denied(a.key, told)]
-    case = _case(start, hypotheses, logs, validate)
+    case = _case(start, hypotheses, logs, validate, (own, others))
     return Prepared(
         case,
         start,
@@ -155,6 +162,20 @@ def prepare(
         model,
         kinematics.agreeing | told,
     )
+
+
+def _corrected(
+    logs: Sequence[TrialLog], clocks: Sequence[Clock], vessel: Vessel
+) -> tuple[list[TrialLog], list[Clock]]:
+    """Return logs without their sensors' defects, and their clocks without the ends so cut."""
+    made = [correct_log(log, vessel) for log in logs]
+    ends = [
+        (new.t[0] - old.t[0], old.t[-1] - new.t[-1]) for old, new in zip(logs, made, strict=True)
+    ]
+    return made, [
+        (first + float(before), length - float(before + after))
+        for (first, length), (before, after) in zip(clocks, ends, strict=True)
+    ]
 
 
 def with_own_sensors(logs: Sequence[TrialLog]) -> list[TrialLog]:
@@ -201,13 +222,16 @@ def _structure(name: str, logs: Sequence[TrialLog], model: ManoeuvringModel | No
 
 def context_of(structure: Structure, ready: Prepared) -> Context:
     """Return what causes are told of a prepared case, with another structure."""
-    return _context(structure, ready.case.logs, ready.case.held_out_logs, ready.model)
+    case = ready.case
+    duration = min(length for _, length in (*case.clocks[0], *case.clocks[1]))
+    return _context(structure, case.logs, case.held_out_logs, duration, ready.model)
 
 
 def _context(
     structure: Structure,
     logs: Sequence[TrialLog],
     validate: Sequence[TrialLog],
+    duration: float,
     model: ManoeuvringModel | None,
 ) -> Context:
     first = logs[0]
@@ -220,7 +244,7 @@ def _context(
         vessel=first.vessel,
         outputs=(*structure.states, "psi") if turns else structure.states,
         has_wind=all(log.has_wind for log in logs),
-        duration=min(float(log.t[-1] - log.t[0]) for log in logs),
+        duration=duration,
         sample_time=first.sample_time,
         speeds=speeds,
         current_known=model is not None and any(model.d[:2]),
@@ -243,6 +267,7 @@ def _case(
     hypotheses: Sequence[Hypothesis],
     logs: Sequence[TrialLog],
     validate: Sequence[TrialLog],
+    clocks: tuple[Sequence[Clock], Sequence[Clock]],
 ) -> DiagnosisProblem:
     names = dict.fromkeys(n for a in hypotheses for n in (*a.columns, *a.co_freed))
     added = [n for n in names if n not in structure.parameters and n not in CURRENTS]
@@ -253,6 +278,7 @@ def _case(
         structure, universe, logs, validate,
         "basic+wind" if wind and structure.uses_air else "basic",
         tuple((s, both) for s in structure.states),
+        clocks=clocks,
     )  # fmt: skip
 
 

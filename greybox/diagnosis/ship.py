@@ -132,6 +132,8 @@ class LogRun:
     integrator : {"euler", "rk4"}
     origin : float, optional
         Time that changes count from [s]; by default the log's first sample.
+    duration : float, optional
+        From there to the end of the log that this one is a part of [s]; by default to its own.
     """
 
     def __init__(
@@ -140,11 +142,13 @@ class LogRun:
         log: TrialLog,
         integrator: Integrator,
         origin: float | None = None,
+        duration: float | None = None,
     ) -> None:
         self.structure, self.log, self.integrator = structure, log, integrator
         self.samples, self.sample_time = len(log), log.sample_time
         self._logged_time = log.logged_time
         self.time = log.t - (log.t[0] if origin is None else origin)
+        self.duration = float(self.time[-1]) if duration is None else duration
         self.states = structure.states
         self._turns = "r" in self.states and "psi" in log
         self.outputs = (*self.states, "psi") if self._turns else self.states

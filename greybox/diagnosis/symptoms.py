@@ -114,7 +114,7 @@ def _conditions(run: LogRun, x: Array) -> Iterator[tuple[str, Mask]]:
         size = np.quantile(np.abs(states["r"]), 0.5)
         yield "when turning to starboard", states["r"] > size
         yield "when turning to port", states["r"] < -size
-    half = run.time > run.time[-1] / 2
+    half = run.time > run.duration / 2
     yield "in the second half of the log", half
     yield "in the first half of the log", ~half
     for name in log.vessel.commands:

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from greybox.diagnosis.null_model import clocks_of
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.ship import Ship
 from greybox.study.blind import draw
+from greybox.trial.segments import as_segments
 
 
 def test_the_order_of_the_logs_leaves_no_propeller_out() -> None:
@@ -27,3 +29,40 @@ def test_the_order_of_the_logs_leaves_no_propeller_out() -> None:
         ship = Ship(np.zeros(0), np.zeros(2), trial.estimation.vessel)
         alike.append(share.apply(ship, np.ones(1)).vessel)
     assert alike[0] == alike[1]
+
+
+def test_changes_count_from_the_start_of_a_log_that_has_gaps() -> None:
+    trial = draw(np.random.default_rng([31, 5]), (), samples=600, positions=False)
+    log = trial.estimation
+    # the first segment is too short for a diagnosis
+    kept = np.ones(600, bool)
+    kept[50:70] = kept[300:330] = False
+    gapped = replace(
+        log,
+        t=log.t[kept] + 1000.0,
+        channels={n: v[kept] for n, v in log.channels.items()},
+        closed_loop=log.closed_loop[kept],
+    )
+    segments = as_segments([gapped, trial.validation])
+    ready = prepare(segments, as_segments(gapped), None, "thesis", ["parameter_change"])
+    case, last = ready.case, float(trial.validation.t[-1])
+    assert [len(x) for x in case.logs] == [230, 270, len(trial.validation)]
+    problem = case.problem("euler")
+    assert [run.time[0] for run in problem.runs] == [70.0, 330.0, 0.0]
+    assert [run.duration for run in problem.runs] == [599.0, 599.0, last]
+    assert [run.time[0] for run in case.held_out("euler").problem.runs] == [70.0, 330.0]
+    moment = ready.hypotheses[0].parameters[1]
+    assert moment.high == 0.95 * min(599.0, last)
+    # parts of segments, held out in turn, and cases made of this one keep that clock
+    alone = prepare(as_segments(gapped), [], None, "thesis", ["parameter_change"]).case
+    for case in (alone, alone.wider(["X_uuu"], "coloured"), alone.acting(log.vessel)):
+        held = [run for _, part in case.held_out("euler").parts for run in part.runs]
+        assert [run.time[0] for run in held if run.log.t[0] >= 1330] == [330.0, 420.0, 510.0]
+        assert {run.duration for run in held} == {599.0}
+
+
+def test_two_logs_of_one_name_are_not_one_log() -> None:
+    trial = draw(np.random.default_rng([31, 5]), (), samples=200, positions=False)
+    one = replace(trial.estimation, name="log")
+    two = replace(trial.validation, name="log", t=trial.validation.t + 500.0)
+    assert [first for first, _ in clocks_of([one, two])] == [0.0, 500.0]
