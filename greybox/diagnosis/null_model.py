@@ -13,7 +13,7 @@ from greybox.diagnosis.evidence.held_out import Folds, HeldOut, OtherLogs
 from greybox.diagnosis.fitting import Metric, Problem
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit, Point
-from greybox.diagnosis.ship import LogRun, Ship, shifted, wired
+from greybox.diagnosis.ship import Change, LogRun, Ship, shifted, wired
 from greybox.errors import ExcitationError
 from greybox.estimation.free_run import fit_free_runs
 from greybox.estimation.output_setup import measured, output_model, output_predictor
@@ -186,7 +186,12 @@ class DiagnosisProblem:
             out.append((self._made(fitting, integrator), self._made(held, integrator)))
         return out
 
-    def base(self, coefficients: Mapping[str, float] | None, current: Array) -> Fit:
+    def base(
+        self,
+        coefficients: Mapping[str, float] | None,
+        current: Array,
+        changes: tuple[Change, ...] = (),
+    ) -> Fit:
         """Return the fit of the model without causes, with the likelier integrator.
 
         A log from a simulation in steps of its sample time wants Euler's rule, a ship
@@ -205,7 +210,7 @@ class DiagnosisProblem:
             # further starts run with the integrator that the first one preferred
             tried = [min(found, key=lambda f: f.cost).integrator] if found else INTEGRATORS
             first = values()
-            fits = map_forked(partial(self._fit, first, current), tried)
+            fits = map_forked(partial(self._fit, first, current, changes), tried)
             found += [f for f in fits if f is not None and not f.escaped]
             if any(self._follows(f) for f in found):
                 break
@@ -253,13 +258,17 @@ class DiagnosisProblem:
         return rough(self.structure, logs, self.kind, self.regime)[0]
 
     def as_given(
-        self, coefficients: Mapping[str, float], current: Array, integrator: Integrator
+        self,
+        coefficients: Mapping[str, float],
+        current: Array,
+        integrator: Integrator,
+        changes: tuple[Change, ...] = (),
     ) -> Fit | None:
         """Return a model as it is, its starts alone fitted; None where its run has no bound."""
         problem = self.problem(integrator)
         theta = np.array([coefficients.get(n, 0.0) for n in self.universe.parameters])
         starts = tuple(run.start() for run in problem.runs)
-        point = Point(Ship(theta, current, self.logs[0].vessel), starts, ())
+        point = Point(Ship(theta, current, self.logs[0].vessel, changes), starts, ())
         errors = problem.errors(point)
         if not all(np.isfinite(e).all() for e in errors):
             return None
@@ -270,6 +279,7 @@ class DiagnosisProblem:
         self,
         coefficients: Mapping[str, float],
         current: Array,
+        changes: tuple[Change, ...],
         integrator: Integrator,
         hypothesis: Hypothesis | None = None,
     ) -> Fit | None:
@@ -277,7 +287,7 @@ class DiagnosisProblem:
         theta = np.array([coefficients.get(n, 0.0) for n in self.universe.parameters])
         places = tuple(problem.place(n) for n in self.structure.parameters)
         starts = tuple(run.start() for run in problem.runs)
-        point = Point(Ship(theta, current, self.logs[0].vessel), starts, places)
+        point = Point(Ship(theta, current, self.logs[0].vessel, changes), starts, places)
         if hypothesis is not None:
             point = problem.add(point, hypothesis)
             starts = tuple(
@@ -373,8 +383,10 @@ class DiagnosisProblem:
         worth += [item for item in ranked if not item[1].refit_from_scratch][:_RESCUED]
         out = []
         for _, hypothesis, first in worth:
-            current = fit.point.base.current
-            found = [self._fit(first, current, i, hypothesis) for i in INTEGRATORS]
+            base = fit.point.base
+            found = [
+                self._fit(first, base.current, base.changes, i, hypothesis) for i in INTEGRATORS
+            ]
             bounded = [f for f in found if f is not None and not f.escaped]
             if bounded:
                 out.append((hypothesis, min(bounded, key=lambda f: f.cost)))

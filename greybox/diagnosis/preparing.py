@@ -13,7 +13,7 @@ from greybox.diagnosis.evidence.kinematics import decided, denied, judged_by_kin
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.null_model import Clock, DiagnosisProblem, clocks_of
 from greybox.diagnosis.point import Fit
-from greybox.diagnosis.ship import CURRENTS
+from greybox.diagnosis.ship import CURRENTS, Change
 from greybox.errors import LogError, UsageError, suggestion
 from greybox.estimation.informative import require_commands, require_motion
 from greybox.model.catalogue import for_inputs, get_structure, structure_for
@@ -82,18 +82,37 @@ class Prepared:
         model = self.model
         if model is None:
             return self.case.base(None, np.zeros(2))
-        return self.case.base(self._coefficients(model), model.d[:2])
+        return self.case.base(self._coefficients(model), model.d[:2], self._changes(model))
 
     def as_given(self) -> Fit | None:
         """Return the model as it was given; None where there is none, or its run has no bound."""
         model = self.model
         if model is None:
             return None
-        return self.case.as_given(self._coefficients(model), model.d[:2], model.integrator)
+        return self.case.as_given(
+            self._coefficients(model), model.d[:2], model.integrator, self._changes(model)
+        )
 
     @staticmethod
     def _coefficients(model: ManoeuvringModel) -> dict[str, float]:
         return dict(zip(model.names, map(float, model.theta), strict=True))
+
+    def _changes(self, model: ManoeuvringModel) -> tuple[Change, ...]:
+        """Return the model's changes, each by how much more than the one before."""
+        before: dict[str, float] = {}
+        out = []
+        for change in sorted(model.changes, key=lambda c: c.time):
+            name = change.parameter
+            was = before.get(name, 1.0)
+            if not was:
+                raise UsageError(
+                    f"{name} of the model is zero and changes again at {change.time:g} s, which a "
+                    f"diagnosis cannot follow: leave its first change out."
+                )
+            place = self.case.universe.parameters.index(name)
+            out.append(Change(place, change.factor / was, change.time))
+            before[name] = change.factor
+        return tuple(out)
 
 
 def prepare(

@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from greybox.diagnosis.null_model import clocks_of
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.ship import Ship
+from greybox.errors import UsageError
+from greybox.model.model import ManoeuvringModel
+from greybox.model.run.changes import Change, factors_at
 from greybox.study.blind import draw
 from greybox.trial.segments import as_segments
 
@@ -66,3 +70,36 @@ def test_two_logs_of_one_name_are_not_one_log() -> None:
     one = replace(trial.estimation, name="log")
     two = replace(trial.validation, name="log", t=trial.validation.t + 500.0)
     assert [first for first, _ in clocks_of([one, two])] == [0.0, 500.0]
+
+
+@pytest.fixture(scope="module")
+def modelled():
+    """Return a trial, and the model of (3.51) that its estimation log asks for."""
+    trial = draw(np.random.default_rng([3, 11]), (), samples=400, positions=False)
+    ready = prepare([trial.estimation], [trial.validation], None, "thesis", ["current"])
+    theta = ready.base().point.base.theta[: len(ready.structure.parameters)]
+    spread = np.zeros((len(theta), len(theta)))
+    model = ManoeuvringModel(ready.structure, theta, spread, 1.0, trial.estimation.vessel)
+    return trial, model
+
+
+def test_a_model_whose_coefficients_change_is_judged_with_its_changes(modelled) -> None:
+    trial, model = modelled
+    changes = (Change("Nr", 0.8, 250.0), Change("Nr", 1.5, 100.0), Change("Xu", 1.2, 120.0))
+    model = replace(model, changes=changes)
+    ready = prepare([trial.estimation], [trial.validation], model, "thesis", ["current"])
+    given = ready.as_given()
+    (run,) = ready.case.problem(given.integrator).runs
+    for k in (0, 110, 200, 399):
+        expected = model.theta * factors_at(changes, model.names, float(k))
+        assert run.parameters(given.point.ship)[k, : len(expected)] == pytest.approx(expected)
+    begun = ready.base().point.base.changes
+    assert begun == given.point.ship.changes
+
+
+def test_a_coefficient_that_comes_back_from_zero_is_refused(modelled) -> None:
+    trial, model = modelled
+    model = replace(model, changes=(Change("Nr", 0.0, 100.0), Change("Nr", 1.0, 200.0)))
+    ready = prepare([trial.estimation], [], model, "thesis", ["current"])
+    with pytest.raises(UsageError, match="Nr of the model is zero and changes again at 200 s"):
+        ready.as_given()
