@@ -27,9 +27,10 @@ from greybox.regression.regression import common_sample_time
 from greybox.selection.estimate import at_own_pace
 from greybox.selection.prediction import require_distinct, require_others
 from greybox.trial.kinematics import decimate_segments
-from greybox.trial.log import Logs, TrialLog
+from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.trial.segments import as_segments
 from greybox.trial.validity import other_conditions, pooled_conditions
+from greybox.validation.fit import at_model_rate
 
 _log = logging.getLogger(__name__)
 
@@ -87,7 +88,8 @@ def diagnose(
     logs : TrialLog or sequence of TrialLog
         To estimate on.
     model : ManoeuvringModel, optional
-        To diagnose; by default (3.51) in still water and air, estimated on the logs.
+        To diagnose; by default (3.51) in still water and air, estimated on the logs. These are
+        taken at its sample time.
         It is judged as it is; beside a cause its coefficients are estimated anew, so that a
         cause is what they cannot mend.
     validate : sequence of TrialLog
@@ -104,7 +106,8 @@ def diagnose(
     ExcitationError
         The logs do not determine the model.
     LogError
-        A log is too short, lacks a channel, or has another sample time.
+        A log is too short, lacks a channel, or has another sample time than the others, or one
+        that the model's is no whole multiple of.
     UsageError
         A cause does not exist.
     """
@@ -114,10 +117,13 @@ def diagnose(
         options.progress(doing)
 
     say("log checks")
+    paced: list[str] = []
+    if model is not None:
+        logs = _at_rate_of(model, as_list(logs), paced)
+        validate = _at_rate_of(model, as_list(validate, 0), paced)
     logs, validate = as_segments(logs), as_segments(validate, 0)
     require_distinct(logs)
     require_others(logs, validate)
-    paced: list[str] = []
     if model is None and options.own_pace:
         logs, validate = _at_own_pace(logs, validate, paced)
     with ExitStack() as begun:
@@ -191,6 +197,20 @@ def diagnose(
         say("a black-box part")
         made = with_remainder(case, report.fit_told, made, ready.validate, options.seed)
     return replace(made, conditions=conditions)
+
+
+def _at_rate_of(
+    model: ManoeuvringModel, logs: Sequence[TrialLog], notes: list[str]
+) -> list[TrialLog]:
+    """Return logs at the sample time of a model, whose coefficients are of its steps."""
+    out = [at_model_rate(log, model) for log in logs]
+    notes += [
+        f"'{log.name}' was taken at {made.sample_time:g} s, the sample time of the model, instead "
+        f"of {log.sample_time:g} s."
+        for log, made in zip(logs, out, strict=True)
+        if made is not log
+    ]
+    return out
 
 
 def _at_own_pace(

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.null_model import clocks_of
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.ship import Ship
-from greybox.errors import UsageError
+from greybox.errors import LogError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.run.changes import Change, factors_at
 from greybox.study.blind import draw
@@ -103,3 +104,23 @@ def test_a_coefficient_that_comes_back_from_zero_is_refused(modelled) -> None:
     ready = prepare([trial.estimation], [], model, "thesis", ["current"])
     with pytest.raises(UsageError, match="Nr of the model is zero and changes again at 200 s"):
         ready.as_given()
+
+
+def test_logs_are_taken_at_the_sample_time_of_the_model(modelled, monkeypatch) -> None:
+    trial, model = modelled
+    given = []
+
+    def stop(logs, validate, *_):
+        given.extend([*logs, *validate])
+        raise LogError("enough is known")
+
+    monkeypatch.setattr("greybox.diagnosis.diagnose.prepare", stop)
+    slow = replace(model, sample_time=2.0)
+    with pytest.raises(LogError, match="enough is known"):
+        diagnose([trial.estimation], validate=[trial.validation], model=slow)
+    assert [log.sample_time for log in given] == [2.0, 2.0]
+    fast = replace(model, sample_time=0.5)
+    with pytest.raises(
+        LogError, match=r"the model's sample time is 0.5 s and 'estimation' has 1 s"
+    ):
+        diagnose([trial.estimation], validate=[trial.validation], model=fast)
