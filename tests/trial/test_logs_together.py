@@ -18,8 +18,9 @@ from greybox.trial.checks.check import check_files, check_recording, check_recor
 from greybox.trial.checks.finding import CheckReport, Finding
 from greybox.trial.checks.motion import make_motion
 from greybox.trial.checks.sensor_offsets.find import Tied, find_offsets
+from greybox.trial.checks.thruster_response import answer_findings, response_findings
 from greybox.trial.import_files import import_files
-from greybox.trial.repair import repair
+from greybox.trial.repair import apply_repairs, repair
 from greybox.trial.steps import mend
 from greybox.vessel.toml import load_vessel, vessel_from_dict
 
@@ -92,6 +93,31 @@ def test_frames_and_signs_are_read_over_all_logs(ship):
     ]  # fmt: skip
     both = check_recordings(recordings[1:], ship)
     assert all(r.findings[0].logs == ("run 1", "run 2") for r in both)
+
+
+def test_a_reversed_rudder_is_reversed_in_all_logs_of_the_ship(tmp_path):
+    """Of a ship by others: logs that cannot tell by themselves are mended, too."""
+    preset = presets()["kvlcc2-7m"]
+    (tmp_path / "ship.toml").write_text(preset.ship.vessel_toml())
+    ship = load_vessel(tmp_path / "ship.toml")
+    logs = []
+    for kind, rows in (("zigzag-10", 400), ("turn-port", 400), ("zigzag-20", 80)):
+        preset.sail(kinds()[kind], seed=1).write_csv(tmp_path / f"{kind}.csv")
+        columns = pd.read_csv(tmp_path / f"{kind}.csv")[:rows]
+        (rudder,) = ship.rudders
+        columns[rudder] *= -1
+        made = as_recording({n: columns[n].to_numpy() for n in columns}, ship)
+        logs.append(replace(made, name=kind))
+    alone = [response_findings(log, ship, []) for log in logs]
+    assert [len(found) for found in alone] == [1, 0, 0]
+    together = answer_findings(logs, ship, [[]] * 3)
+    assert {f.channels for (f,) in together} == {(rudder,)}
+    assert {f.logs for (f,) in together} == {("zigzag-10", "turn-port", "zigzag-20")}
+    mended = [apply_repairs(log, found) for log, found in zip(logs, together, strict=True)]
+    assert answer_findings(mended, ship, [[]] * 3) == [[]] * 3
+    # one log of another sign than the others is read by itself
+    apart = answer_findings([logs[0], *mended[1:]], ship, [[]] * 3)
+    assert [[f.channels for f in found] for found in apart] == [[(rudder,)], [], []]
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ from greybox.trial.checks.signal_quality import (
     stuck_findings,
     time_findings,
 )
-from greybox.trial.checks.thruster_response import response_findings
+from greybox.trial.checks.thruster_response import answer_findings
 from greybox.trial.checks.time_format import time_format_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.channel_mapping import read_recording
@@ -260,11 +260,11 @@ def _forces(logs: Sequence[_Log], vessel: Vessel) -> None:
     for log in logs:
         log.findings += wind_findings(log.mended, log.findings)
     pushed, untold = force_findings([log.mended for log in logs], vessel)
-    for log, forces, reason in zip(logs, pushed, untold, strict=True):
-        # what pushes the ship from outside tells nothing of the signs of its thrusters
-        own = apply_repairs(log.mended, forces)
-        signs = response_findings(own, vessel, log.findings)
-        log.findings += signs
+    # what pushes the ship from outside tells nothing of the signs of its thrusters
+    own = [apply_repairs(log.mended, forces) for log, forces in zip(logs, pushed, strict=True)]
+    signs = answer_findings(own, vessel, [log.findings for log in logs])
+    for log, forces, reason, found in zip(logs, pushed, untold, signs, strict=True):
+        log.findings += found
         doubt = next(
             (f for f in log.findings if f.id in ("sign", "frame", "unit") and not f.safe), None
         )

@@ -7,6 +7,7 @@ only where that explains the motion far better than the columns as they are.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -55,75 +56,170 @@ class _Alternative:
     repair: tuple[Step, ...]
 
 
+# by state, the log-likelihood that the force adds
+Explained = dict[str, float]
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """How a ship answers in one log: what the force explains as named, and read otherwise."""
+
+    motion: Motion
+    inputs: dict[str, Array]
+    as_named: Explained
+    read_so: tuple[Explained, ...]
+
+    def explained(self, k: int | None) -> Explained:
+        """Return what the force explains under the alternative `k`; None is as named."""
+        return self.as_named if k is None else self.read_so[k]
+
+    @property
+    def sample_correlation_factor(self) -> float:
+        """How many samples of a fast log say the same."""
+        return max(1.0, 0.2 / self.motion.step)
+
+
 def response_findings(
-    recording: Recording, vessel: Vessel, findings: list[Finding]
+    recording: Recording, vessel: Vessel, findings: Sequence[Finding]
 ) -> list[Finding]:
-    """Find thruster columns that are swapped or reversed.
+    """Find thruster columns of one log that are swapped or reversed, as `answer_findings` does."""
+    return answer_findings([recording], vessel, [findings])[0]
+
+
+def answer_findings(
+    recordings: Sequence[Recording], vessel: Vessel, findings: Sequence[Sequence[Finding]]
+) -> list[list[Finding]]:
+    """Find thruster columns that are swapped or reversed, over all logs of one ship together.
 
     Each velocity is the integral of damping and force, with a force gain that
     must be positive; what remains is measurement noise on a random walk (see
     `motion`). The readings of the columns are compared by what the force then
-    explains, equation by equation.
+    explains, equation by equation, in all logs. A log that refutes what they
+    prefer together by as much is read by itself.
 
     Parameters
     ----------
-    recording : Recording
+    recordings : sequence of Recording
         Canonical, mended.
     vessel : Vessel
-    findings : list of Finding
-        Those made before.
+    findings : sequence of sequence of Finding
+        Those made before, log by log.
+
+    Returns
+    -------
+    list of list of Finding
+        Log by log: at most one, in every log in which its channels move.
     """
-    if any(f.id == "frame" and not f.safe for f in findings):
-        return []
-    commands = [
-        c for c in vessel.commands if c in recording and np.isfinite(recording[c].value).any()
+    commands = list(vessel.commands)
+    alternatives = _alternatives(vessel, commands)
+    answers = [
+        None
+        if any(f.id == "frame" and not f.safe for f in told)
+        else _answer(recording, vessel, alternatives)
+        for recording, told in zip(recordings, findings, strict=True)
     ]
-    if len(commands) < len(vessel.commands):
-        return []
+    known = {i: a for i, a in enumerate(answers) if a is not None}
+    together, apart = list(known), []
+    while together:
+        shared = _decide([known[i] for i in together])
+        against = [i for i in together if len(together) > 1 and _contradicts(known[i], shared)]
+        if not against or len(against) == len(together):
+            break
+        apart += against
+        together = [i for i in together if i not in against]
+    found: list[list[Finding]] = [[] for _ in recordings]
+    # a log that cannot tell is read as the others are
+    follows = [i for i in range(len(recordings)) if i not in apart]
+    for deciding, members in ((together, follows), *(([i], [i]) for i in apart)):
+        told = [known[i] for i in deciding]
+        k = _decide(told)
+        if k is None:
+            continue
+        alternative = alternatives[k]
+        moved = [i for i in members if _moves(recordings[i], alternative.channels)]
+        names = tuple(recordings[i].name for i in moved) if len(moved) > 1 else ()
+        for i in moved:
+            finding = _finding(alternative, _gain(told, k), len(told), names)
+            if (answer := known.get(i)) is not None:
+                inputs = _as_read(answer.inputs, alternative)
+                shown = _picture(answer.motion, vessel, answer.inputs, inputs)
+                finding = replace(finding, picture=shown)
+            found[i].append(finding)
+    return found
+
+
+def _answer(
+    recording: Recording, vessel: Vessel, alternatives: Sequence[_Alternative]
+) -> _Answer | None:
+    """Return how the ship answers, None where the log has too little to tell."""
+    for c in vessel.commands:
+        if c not in recording or not np.isfinite(recording[c].value).any():
+            return None
     motion = _turning_motion(recording)
     if motion is None:
-        return []
-    inputs = {c: _held(recording, c, motion.t) for c in commands}
+        return None
+    inputs = {c: _held(recording, c, motion.t) for c in vessel.commands}
     motion, inputs = _open_loop(recording, vessel, motion, inputs)
     if len(motion) < _MIN_SAMPLES:
-        return []
+        return None
     problem = _Problem(motion)
-    base = problem.explained(vessel, inputs)
-    best: tuple[float, _Alternative] | None = None
-    for alternative in _alternatives(vessel, commands):
-        found = problem.explained(vessel, _as_read(inputs, alternative))
-        # a state that no force moves under one reading gains nothing by it
-        both = found.keys() | base.keys()
-        changes = [found.get(s, 0.0) - base.get(s, 0.0) for s in sorted(both)]
-        gain = float(sum(changes))
-        won, lost = sum(c for c in changes if c > 0), -sum(c for c in changes if c < 0)
-        clear = any(
-            found.get(s, 0.0) > _LEAST_RATIO * base.get(s, 0.0) + _LEAST_GAIN / 2 for s in both
-        )
-        if clear and lost < _MOST_LOSS * won and (best is None or gain > best[0]):
-            best = (gain, alternative)
-    sample_correlation_factor = max(1.0, 0.2 / motion.step)
-    if best is None or best[0] < _LEAST_GAIN * sample_correlation_factor:
-        return []
-    gain, a = best
-    single = len(a.repair[0].channels) == 1
-    value = -1.0 if single else 0.0
-    return [
-        Finding(
-            "sign",
-            a.channels[0],
-            value,
-            (value, value),
-            "1",
-            f"the ship answers as if {a.words}: read so, the force explains its motion far better "
-            f"(log-likelihood higher by {gain:.0f}); a check of response, not of kinematics",
-            a.fix,
-            a.channels,
-            a.repair,
-            False,
-            _picture(motion, vessel, inputs, _as_read(inputs, a)),
-        )
-    ]
+    read_so = tuple(problem.explained(vessel, _as_read(inputs, a)) for a in alternatives)
+    return _Answer(motion, inputs, problem.explained(vessel, inputs), read_so)
+
+
+def _decide(answers: Sequence[_Answer]) -> int | None:
+    """Return the alternative that these logs prefer together; None where it is as named."""
+    if not answers:
+        return None
+    gains = [_gain(answers, k) for k in range(len(answers[0].read_so))]
+    best = max(range(len(gains)), key=gains.__getitem__, default=None)
+    return best if best is not None and gains[best] > 0 else None
+
+
+def _gain(answers: Sequence[_Answer], one: int | None, other: int | None = None) -> float:
+    """Return the log-likelihood by which one reading is better than another; 0 if not by far."""
+    found, base = (
+        {s: sum(a.explained(k).get(s, 0.0) for a in answers) for s in _STATES} for k in (one, other)
+    )
+    # a state that no force moves under one reading gains nothing by it
+    changes = [found[s] - base[s] for s in _STATES]
+    gain = float(sum(changes))
+    won, lost = sum(c for c in changes if c > 0), -sum(c for c in changes if c < 0)
+    clear = any(found[s] > _LEAST_RATIO * base[s] + _LEAST_GAIN / 2 for s in _STATES)
+    least = _LEAST_GAIN * max(a.sample_correlation_factor for a in answers)
+    return gain if clear and lost < _MOST_LOSS * won and gain >= least else 0.0
+
+
+def _contradicts(answer: _Answer, shared: int | None) -> bool:
+    """Whether a log by itself refutes what the logs prefer together."""
+    if shared is None:
+        return _decide([answer]) is not None
+    return _gain([answer], None, shared) > 0
+
+
+def _moves(recording: Recording, channels: Sequence[str]) -> bool:
+    """Whether a log has all of these channels, and one of them does not rest at zero."""
+    if not all(c in recording for c in channels):
+        return False
+    return any(np.nanmax(np.abs(recording[c].value), initial=0.0) > 0 for c in channels)
+
+
+def _finding(a: _Alternative, gain: float, count: int, names: tuple[str, ...]) -> Finding:
+    value = -1.0 if len(a.repair[0].channels) == 1 else 0.0
+    beside = f" in {count} logs together" if count > 1 else ""
+    return Finding(
+        "sign",
+        a.channels[0],
+        value,
+        (value, value),
+        "1",
+        f"the ship answers as if {a.words}: read so, the force explains its motion far better "
+        f"(log-likelihood higher by {gain:.0f}{beside}); a check of response, not of kinematics",
+        a.fix,
+        a.channels,
+        a.repair,
+        logs=names,
+    )
 
 
 def _turning_motion(recording: Recording) -> Motion | None:
@@ -246,10 +342,10 @@ class _Problem:
             near = np.minimum(coarse.gain * np.array([0.6, 1.0, 1.6]), 1.0)
             self.without[s] = profile(motion[s], self.columns, motion, near)
 
-    def explained(self, vessel: Vessel, inputs: dict[str, Array]) -> dict[str, float]:
+    def explained(self, vessel: Vessel, inputs: dict[str, Array]) -> Explained:
         """Return by state the log-likelihood that the force adds; no less than zero."""
         force = generalised_force(vessel, inputs)
-        found: dict[str, float] = {}
+        found: Explained = {}
         for s in self.states:
             f = _force_of(force, s)
             if f is None or np.std(f) == 0:
