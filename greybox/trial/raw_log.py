@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.notebook import DisplayMixin, items, number, sparkline, table
-from greybox.trial.steps import Step
+from greybox.trial.steps import Step, on_zero
 from greybox.vessel.conditions import Conditions
 
 Array = NDArray[np.float64]
@@ -129,13 +129,18 @@ class Recording(DisplayMixin):
     @property
     def cuts(self) -> tuple[float, ...]:
         """Times [s] at which positions begin anew: no stretch of the log reaches over them."""
-        times: list[float] = []
+        return tuple(sorted({t for step in self.cut_steps for t in step.numbers("times")}))
+
+    @property
+    def cut_steps(self) -> tuple[Step, ...]:
+        """The steps that cut the log, at the times to which positions were moved since."""
+        found: list[Step] = []
         for step in self.steps:
             if step.operation == "cut":
-                times += step.numbers("times")
+                found.append(step)
             elif step.operation == "shift" and "x_n" in step.channels:
-                times = [t - step.number("late") for t in times]
-        return tuple(sorted(set(times)))
+                found = [on_zero(cut, -step.number("late")) for cut in found]
+        return tuple(found)
 
     def summary(self) -> str:
         """Return the signals with units, times and ranges, and the notes, as text."""

@@ -233,6 +233,21 @@ def test_a_cut_moves_with_the_file_that_is_merged():
     assert merged.steps[0].interval == (1040.0, 1060.0)
 
 
+def test_a_cut_moves_with_the_positions_of_its_own_file():
+    t = np.arange(100.0)
+    cut, late = mend("cut", ("x_n", "y_n"), times=(50.0,)), mend("shift", ("x_n", "y_n"), late=2.0)
+    both = [replace(as_recording({"t": t, "u": 0 * t}), epoch=e) for e in (1000.0, 2000.0)]
+
+    def cuts(*steps):
+        of_files = (replace(r, steps=s) for r, s in zip(both, steps, strict=True))
+        return merge(list(of_files)).cuts
+
+    assert cuts((cut,), (late,)) == (50.0,)
+    # as often as a file was moved, even by the same step
+    assert cuts((cut, late), (cut, late)) == (48.0, 1048.0)
+    assert cuts((late,), (cut,)) == (1050.0,)
+
+
 def _shift(channels, late):
     from greybox.trial.checks.finding import Finding
 

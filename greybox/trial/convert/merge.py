@@ -52,10 +52,13 @@ def merge(recordings: list[Recording]) -> Recording:
     text: dict[str, tuple[Array, NDArray[Any]]] = {}
     notes: list[str] = []
     steps: list[Step] = []
+    cuts: list[Step] = []
     for r in recordings:
         shift = r.epoch - epoch if epoch is not None and r.epoch is not None else 0.0
         notes += [f"{r.name}: {n}" for n in r.notes]
-        steps += [on_zero(s, shift) for s in r.steps]
+        # last, since what moved the positions of one file moved no other's
+        cuts += [on_zero(s, shift) for s in r.cut_steps]
+        steps += [on_zero(s, shift) for s in r.steps if s.operation != "cut"]
         moved: dict[int, Array] = {}
         for s in r.signals:
             t = moved.setdefault(id(s.t), s.t + shift)
@@ -88,7 +91,7 @@ def merge(recordings: list[Recording]) -> Recording:
         tuple(f for r in recordings for f in r.files),
         tuple(notes),
         conditions=reduce(Conditions.over, (r.conditions for r in recordings)),
-        steps=new_steps((), steps),
+        steps=new_steps((), [*steps, *cuts]),
         unsure=frozenset(unsure),
     )
 
