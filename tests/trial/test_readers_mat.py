@@ -278,6 +278,8 @@ def test_a_stated_second_is_no_day(tmp_path):
     for tree in (
         {"time_s": column(750000 + T)},
         {"log": {"time": 750000 + T, "TimeInfo": {"Units": "seconds"}}},
+        # nobody logs a sample a day
+        {"t": column(750000 + T)},
     ):
         where = tree.get("log", tree)
         where["u"] = column(U)

@@ -438,7 +438,7 @@ def _time(name: str, value: Any, stated: str | None) -> _Time | None:
     if not steps.max() > 0 or np.mean(steps >= 0) < _RISING:
         return None
     middle = float(np.median(known))
-    if stated in (None, "d") and _DATENUM[0] <= middle <= _DATENUM[1]:
+    if _counts_days(known, stated):
         start = float(known[0])
         note = f"'{name}' was taken as MATLAB datenum (days), for it is near {middle:.0f}."
         t = np.asarray((raw - start) * 86400.0, float)
@@ -454,6 +454,14 @@ def _time(name: str, value: Any, stated: str | None) -> _Time | None:
         return _Time(name, t, float(first) * factor, note)
     note = f"'{name}' was taken as time in {unit}." if unit != "s" else ""
     return _Time(name, np.asarray(raw, float) * factor, None, note)
+
+
+def _counts_days(known: NDArray[Any], stated: str | None) -> bool:
+    """Whether times are MATLAB's datenum, by their unit and size, or by size and step."""
+    if stated not in (None, "d") or not _DATENUM[0] <= np.median(known) <= _DATENUM[1]:
+        return False
+    # seconds as large are days apart when they are read as days
+    return stated == "d" or time_unit((known - known[0]) * 86400.0) == "s"
 
 
 def _dates(name: str, value: list[Any]) -> _Time | None:
