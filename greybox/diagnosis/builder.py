@@ -108,10 +108,11 @@ class DiagnosisBuilder:
         out = np.outer(moved, moved)
         problem = self.case.problem(fit.integrator)
         for cause in self.found.causes:
-            if cause.standing is None:
+            if cause.standing is None or cause.told is not None:
+                # the fit holds those that stand already
                 continue
             where = problem.numbers_of(fit.point, cause.hypothesis)
-            for i, by in zip(where, cause.standing.moved, strict=True):
+            for i, by in zip(where, cause.standing.moved, strict=False):
                 out[i, i] = max(out[i, i], by**2)
         return np.asarray(out)
 
