@@ -25,8 +25,8 @@ from greybox.numerics.recursion import propagate
 from greybox.numerics.robust import robust_deviation
 from greybox.trial.actuator_estimate import ActuatorEstimate, Measured
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.convert.derived_signals import continuous
-from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.checks.motion import orderly
+from greybox.trial.raw_log import Recording
 from greybox.vessel.vessel import Actuator, ActuatorKind, Vessel
 
 Array = NDArray[np.float64]
@@ -148,8 +148,11 @@ class _Pair:
 def _pair(recording: Recording, actuator: Actuator) -> _Pair | None:
     if actuator.command not in recording or actuator.feedback not in recording:
         return None
-    tc, c = _orderly(recording[actuator.command], actuator.angular)
-    t, y = _orderly(recording[actuator.feedback], actuator.angular)
+    command, feedback = (
+        orderly(recording[n], angular=actuator.angular)
+        for n in (actuator.command, actuator.feedback)
+    )
+    tc, c, t, y = command.t, command.value, feedback.t, feedback.value
     if len(tc) < _FEWEST_SAMPLES or len(t) < _FEWEST_SAMPLES:
         return None
     begin = max(tc[0], t[0])
@@ -163,13 +166,6 @@ def _pair(recording: Recording, actuator: Actuator) -> _Pair | None:
     at = np.concatenate([[0], change])
     circular = actuator.kind == "angle"
     return _Pair(recording.name, tc[at], c[at], t[keep], y[keep], step, circular)
-
-
-def _orderly(signal: Signal, angular: bool) -> tuple[Array, Array]:
-    keep = np.isfinite(signal.value) & np.isfinite(signal.t)
-    t, first = np.unique(signal.t[keep], return_index=True)
-    value = signal.value[keep][first]
-    return t, continuous(value) if angular and len(value) else value
 
 
 # parameters of the model, in the order of the arrays below

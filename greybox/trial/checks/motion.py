@@ -10,8 +10,9 @@ disagreement as the noises demand; K is estimated by maximum likelihood.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,7 +123,7 @@ def make_motion(recording: Recording, names: tuple[str, ...] = NAMES) -> Motion 
     signals = {}
     for name in names:
         if name in recording:
-            s = _orderly(recording[name])
+            s = orderly(recording[name], angular=name == "psi")
             if len(s) >= _MIN_STRETCH:
                 signals[name] = s
     if not signals:
@@ -151,14 +152,12 @@ def _length(run: tuple[int, int]) -> int:
     return run[1] - run[0]
 
 
-def _orderly(s: Signal) -> Signal:
+def orderly(s: Signal, *, angular: bool) -> Signal:
+    """Return a signal in the order of its times, each once and finite; an angle continuous."""
     keep = np.isfinite(s.value) & np.isfinite(s.t)
-    t, value = s.t[keep], s.value[keep]
-    t, once = np.unique(t, return_index=True)
-    value = value[once]
-    if s.name == "psi" and len(value):
-        value = continuous(value)
-    return Signal(s.name, t, value, s.unit)
+    t, once = np.unique(s.t[keep], return_index=True)
+    value = s.value[keep][once]
+    return Signal(s.name, t, continuous(value) if angular else value, s.unit)
 
 
 def integrate(rate: Array, motion: Motion) -> Array:
@@ -316,6 +315,16 @@ def denoise(value: Array, motion: Motion) -> Array:
             best, chosen = error / count, width
     slow = smooth(value, motion, chosen * motion.step)
     return slow + smooth(value - slow, motion, chosen * motion.step)
+
+
+def integrated_damping(motion: Motion, states: Sequence[str]) -> Array:
+    """Return what damps a ship, integrated (N, q): 1, x, x|x| and products of the states x."""
+    x = {s: denoise(motion[s], motion) for s in states}
+    rates = [np.ones(len(motion))]
+    rates += [x[s] for s in states]
+    rates += [x[s] * np.abs(x[s]) for s in states]
+    rates += [x[a] * x[b] for a, b in combinations(states, 2)]
+    return integrate(np.column_stack(rates), motion)
 
 
 def to_ned(psi: Array, forward: Array, starboard: Array) -> Array:

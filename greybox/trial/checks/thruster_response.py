@@ -21,6 +21,7 @@ from greybox.trial.checks.motion import (
     Profile,
     denoise,
     integrate,
+    integrated_damping,
     make_motion,
     profile,
     solve,
@@ -327,12 +328,7 @@ class _Problem:
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
         self.states = [s for s in _STATES if s in motion]
-        x = {s: denoise(motion[s], motion) for s in self.states}
-        rates = [np.ones(len(motion))]
-        rates += [x[s] for s in self.states]
-        rates += [x[s] * np.abs(x[s]) for s in self.states]
-        rates += [x[a] * x[b] for a, b in combinations(self.states, 2)]
-        columns = integrate(np.column_stack(rates), motion)
+        columns = integrated_damping(motion, self.states)
         size = np.sqrt(np.mean(columns**2, axis=0))
         self.columns = columns / np.where(size > 0, size, 1.0)
         self.without: dict[str, Profile] = {}

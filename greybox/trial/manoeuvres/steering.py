@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy import ndimage
 
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres.local import noise_std
+from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
@@ -65,15 +67,9 @@ def steering_angle(log: TrialLog) -> tuple[Array, float | None] | None:
             x for n in rudders if (x := _greatest(vessel.limits[n].lower, n, log)) is not None
         ]
         return np.mean([log[n] for n in rudders], axis=0), min(limits, default=None)
-    azimuths = {
-        t.angle: (-1.0 if t.x <= 0 else 1.0) for t in vessel.thrusters if isinstance(t.angle, str)
-    }
+    azimuths = _azimuths(vessel)
     if azimuths and all(name in log for name in azimuths):
-        # modulo half a turn: thrust straight astern is straight as well
-        parts = [
-            sign * ((log[n] + math.pi / 2) % math.pi - math.pi / 2) for n, sign in azimuths.items()
-        ]
-        return np.mean(parts, axis=0), None
+        return np.mean(_deviations(log, azimuths), axis=0), None
     return None
 
 
@@ -112,18 +108,28 @@ def sideways(log: TrialLog) -> NDArray[np.bool_]:
     ndarray of bool
         (N,); never for a vessel with rudders, or with one azimuth thruster.
     """
-    columns = {t.angle: t.x for t in log.vessel.thrusters if isinstance(t.angle, str)}
-    if any(t.rudder is not None for t in log.vessel.thrusters) or len(columns) < 2:
+    azimuths = _azimuths(log.vessel)
+    if any(t.rudder is not None for t in log.vessel.thrusters) or len(azimuths) < 2:
         return np.zeros(len(log), bool)
-    parts = [
-        (-1.0 if x <= 0 else 1.0) * ((log[n] + math.pi / 2) % math.pi - math.pi / 2)
-        for n, x in columns.items()
-    ]
+    parts = _deviations(log, azimuths)
     apart = np.max(parts, axis=0) - np.min(parts, axis=0)
     largest = np.abs(parts).max(axis=0)
     # some stay straight while others steer: these do not oppose one another
     opposed = np.min(parts, axis=0) * np.max(parts, axis=0) < 0
     return np.asarray(opposed & (apart > _OPPOSED) & (apart > largest))
+
+
+def _azimuths(vessel: Vessel) -> dict[str, float]:
+    """Return the columns of azimuth angles, with the sign by which they turn the ship."""
+    return {
+        t.angle: (-1.0 if t.x <= 0 else 1.0) for t in vessel.thrusters if isinstance(t.angle, str)
+    }
+
+
+def _deviations(log: TrialLog, azimuths: Mapping[str, float]) -> list[Array]:
+    """Return how far each azimuth (N,) is off straight, as a rudder would be [rad]."""
+    # modulo half a turn: thrust straight astern is straight as well
+    return [sign * ((log[n] + math.pi / 2) % math.pi - math.pi / 2) for n, sign in azimuths.items()]
 
 
 def _greatest(lower: float | None, name: str, log: TrialLog) -> float | None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 from greybox.trial.checks.motion import (
     GAINS,
     Motion,
-    denoise,
     integrate,
+    integrated_damping,
     make_motion,
     solve,
     whiten,
@@ -129,12 +128,7 @@ def _profiles(
 ) -> dict[str, tuple[Array, float]]:
     """Return by state the log-likelihood of each delay, and that of no force at all."""
     states = [s for s in ("u", "v", "r") if s in motion]
-    calm = {s: denoise(motion[s], motion) for s in states}
-    rates = [np.ones(len(motion))]
-    rates += [calm[s] for s in states]
-    rates += [calm[s] * np.abs(calm[s]) for s in states]
-    rates += [calm[a] * calm[b] for a, b in combinations(states, 2)]
-    damping = np.column_stack([integrate(np.column_stack(rates), motion), *_slow(motion)])
+    damping = np.column_stack([integrated_damping(motion, states), *_slow(motion)])
     start, stop = motion.t[0] + _DELAYS[0] - 7.0, motion.t[-1] - _DELAYS[0] + 1.0
     fine = np.arange(start, stop, 0.1)
     held = {}
