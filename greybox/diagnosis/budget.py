@@ -238,9 +238,11 @@ def error_budget(
         return ()
     problem = final[0].held
     names = problem.structure.states
+    known = _measured([pair.held for pair in final])
+    counts = known.sum(axis=0)
     e0, e1 = base, np.concatenate([_states(p.held, p.held_fit) for p in final])
     beside = [generic_force(pair).errors for pair in final]
-    rest = np.concatenate([np.concatenate(errors) for errors in beside])[:, : len(names)]
+    rest = np.concatenate([np.concatenate(errors) for errors in beside])[:, : len(names)] * known
     # a force that makes held-out runs worse explains nothing of them
     helps = (rest**2).sum(axis=0) < (e1**2).sum(axis=0)
     rest = np.where(helps, rest, e1)
@@ -259,12 +261,15 @@ def error_budget(
         alone = (terms**2).sum(axis=0) < (e0**2).sum(axis=0)
         without[MOTION] = np.where(alone, terms, e0)
         before[MOTION] = before[MOTION] + e0**2 - without[MOTION] ** 2
-    moments = _moments(noise, problem, names, waves, rest)
+    mean = (rest**2).sum(axis=0) / np.maximum(counts, 1)
+    moments = _moments(noise, problem, names, waves, mean)
     rng = np.random.default_rng([seed, 11])
     starts, length = blocks(len(e0), problem.sample_time, _DRAWS, rng)
     wide = {c.id: 1 + c.relative * rng.standard_normal((_DRAWS, 1)) for c in causes}
     whole, drawn_whole = (e0**2).sum(axis=0), block_sums(e0**2, starts, length)
-    left = np.maximum((e1**2).sum(axis=0) - len(e0) * moments[SENSOR], 0.0)
+    # a channel that was measured nowhere has no error
+    whole, drawn_whole = np.maximum(whole, 1e-300), np.maximum(drawn_whole, 1e-300)
+    left = np.maximum((e1**2).sum(axis=0) - counts * moments[SENSOR], 0.0)
     # the ship without the cause is known as well as the extended model follows it
     unsure = {
         name: 2
@@ -273,7 +278,7 @@ def error_budget(
         * np.cos(rng.uniform(0, 2 * np.pi, (_DRAWS, len(names))))
         for name, errors in without.items()
     }
-    length_drawn = starts.shape[1] * length
+    drawn_counts = block_sums(known.astype(float), starts, length)
 
     def shares(parts: dict[str, Array], of: Array) -> tuple[dict[str, Array], dict[str, Array]]:
         """Return the shares (nx,) and their draws (draws, nx) of parts of a squared error."""
@@ -282,8 +287,8 @@ def error_budget(
         for name in set(parts) & set(without):
             draws[name] = draws[name] * wide.get(name, 1.0) + unsure[name]
         for name, moment in moments.items():
-            point[name] = len(e0) * moment / whole
-            draws[name] = length_drawn * moment / drawn_whole
+            point[name] = counts * moment / whole
+            draws[name] = drawn_counts * moment / drawn_whole
         point[REST] = of.sum(axis=0) / whole - sum(point.values())
         draws[REST] = block_sums(of, starts, length) / drawn_whole - sum(draws.values())
         return point, draws
@@ -305,13 +310,21 @@ def error_budget(
 
 
 def _states(held: Problem, fit: Fit) -> Array:
-    """Return the held-out errors of the states, (N, nx)."""
-    return np.concatenate([e[:, : len(held.structure.states)] for e in fit.errors])
+    """Return the held-out errors of the states, (N, nx), zero where nothing was measured."""
+    return np.concatenate(fit.errors)[:, : len(held.structure.states)] * _measured([held])
+
+
+def _measured(held: Sequence[Problem]) -> NDArray[np.bool_]:
+    """Return where the states of held-out logs were measured, (N, nx)."""
+    known = np.concatenate([known for problem in held for known in problem.known])
+    return known[:, : len(held[0].structure.states)]
 
 
 def _noise_of(pair: Pair, errors: Sequence[Array]) -> Noise:
     held, fit = pair.held, pair.held_fit
-    return fit_noise(errors, held.poles(fit.point), held.sample_time, held.groups, fit.noise)
+    return fit_noise(
+        errors, held.poles(fit.point), held.sample_time, held.groups, fit.noise, known=held.known
+    )
 
 
 def _moments(
@@ -319,9 +332,9 @@ def _moments(
     problem: Problem,
     names: Sequence[str],
     waves: Waves | None,
-    rest: Array,
+    mean: Array,
 ) -> dict[str, Array]:
-    """Return mean squares (nx,) of what only its spectrum tells apart."""
+    """Return mean squares (nx,) of what only its spectrum tells apart, of those `mean` in all."""
     samples = sum(count for _, count in noise)
     sensor, slow = np.zeros(len(names)), np.zeros(len(names), bool)
     for k, group in enumerate(problem.groups):
@@ -329,7 +342,6 @@ def _moments(
         sensor[i] = sum(float(n.groups[k].sensor[0] ** 2) * c for n, c in noise) / samples
         remembered = max(n.groups[k].remembered for n, _ in noise)
         slow[i] = remembered * problem.sample_time > GUST
-    mean = (rest**2).mean(axis=0)
     sensor = np.minimum(sensor, mean)
     line = np.array([0.0 if waves is None else waves.std.get(s, 0.0) ** 2 for s in names])
     line = np.minimum(line, mean - sensor)

@@ -20,6 +20,7 @@ from greybox.diagnosis.thresholds import DECIDED
 from greybox.numerics.lagged_moments import automatic_lags, bartlett_sums
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Metric = Literal["coloured", "free run"]
 
 # a step that promises less than this of −2 log L ends the search
@@ -65,11 +66,14 @@ class _Normal:
     matrix: Array
 
     @classmethod
-    def of(cls, at: Array, noise: Noise, slopes: Sequence[_Own]) -> _Normal:
+    def of(cls, at: Array, noise: Noise, slopes: Sequence[_Own], known: Sequence[Mask]) -> _Normal:
         matrix = np.zeros((len(at), len(at)))
         # of a run at the edge of stability the derivatives may leave every number's range
         with np.errstate(over="ignore", invalid="ignore"):
-            rows = tuple((noise.whiten(slope), where) for slope, where in slopes)
+            rows = tuple(
+                (_measured(noise.whiten(slope), seen), where)
+                for (slope, where), seen in zip(slopes, known, strict=True)
+            )
             for own, where in rows:
                 by_channel = own.transpose(1, 2, 0)
                 matrix[np.ix_(where, where)] += sum(r @ r.T for r in by_channel)
@@ -90,11 +94,19 @@ class _Normal:
             return bool(away @ self.matrix @ away < _NEAR)
 
 
-def _moved_little(away: Array, noise: Noise, slopes: Sequence[_Own]) -> bool:
+def _measured(e: Array, known: Mask) -> Array:
+    """Return innovations (N, ny, m), zero where nothing was measured."""
+    return e if known.all() else np.where(known[:, :, None], e, 0.0)
+
+
+def _moved_little(away: Array, noise: Noise, slopes: Sequence[_Own], known: Sequence[Mask]) -> bool:
     """Whether derivatives do for a vector so far away, too: `_Normal.near` without a matrix."""
     with np.errstate(over="ignore", invalid="ignore"):
         moved = [np.matmul(away[where], own.transpose(1, 2, 0)).T for own, where in slopes]
-        return bool(sum((noise.whiten(m[:, :, None]) ** 2).sum() for m in moved) < _NEAR)
+        white = (
+            _measured(noise.whiten(m[:, :, None]), k) for m, k in zip(moved, known, strict=True)
+        )
+        return bool(sum((m**2).sum() for m in white) < _NEAR)
 
 
 class Problem:
@@ -111,6 +123,8 @@ class Problem:
 
     def __init__(self, runs: Sequence[LogRun], metric: Metric = "coloured") -> None:
         self.runs, self.metric = tuple(runs), metric
+        # where each output was measured, (N, ny) of each log: nothing else counts
+        self.known = tuple(run.known for run in runs)
         self.structure = runs[0].structure
         self.sample_time = runs[0].sample_time
         self.groups = groups_of(runs[0])
@@ -190,6 +204,16 @@ class Problem:
             values=point.values[:k] + point.values[k + 1 :],
         )
 
+    def squares(self, errors: Sequence[Array]) -> Array:
+        """Return the sums of squared errors (N, ny) of each log where measured, (ny,)."""
+        parts = zip(errors, self.known, strict=True)
+        return np.asarray(np.sum([(e**2).sum(axis=0, where=known) for e, known in parts], axis=0))
+
+    @property
+    def counts(self) -> NDArray[np.int_]:
+        """How many samples of each output were measured, (ny,)."""
+        return np.asarray(np.concatenate(self.known).sum(axis=0))
+
     def errors(self, point: Point) -> list[Array]:
         """Return measured less simulated of each log, infinite where a run escaped."""
         ship = point.ship
@@ -199,13 +223,16 @@ class Problem:
         ]
 
     def whitened(self, noise: Noise, errors: Sequence[Array]) -> tuple[list[Array], float]:
-        """Return innovations and −2 log L of errors."""
+        """Return innovations, zero where nothing was measured, and −2 log L of errors."""
         if not all(np.isfinite(e).all() for e in errors):
             return [], np.inf
-        nu = [noise.whiten(e[:, :, None])[:, :, 0] for e in errors]
+        nu = [
+            _measured(noise.whiten(e[:, :, None]), known)[:, :, 0]
+            for e, known in zip(errors, self.known, strict=True)
+        ]
         with np.errstate(over="ignore"):
             cost = sum(float((n**2).sum()) for n in nu)
-        return nu, cost + noise.log_det * sum(len(e) for e in errors)
+        return nu, cost + float(self.counts @ noise.log_sizes)
 
     def rows(self, point: Point, noise: Noise) -> list[Array]:
         """Return whitened derivatives of the outputs in the free numbers, (N, ny, q) per log."""
@@ -214,7 +241,10 @@ class Problem:
                 return found
         # of a run at the edge of stability the derivatives may leave every number's range
         with np.errstate(over="ignore", invalid="ignore"):
-            made = [noise.whiten(slopes) for slopes in self.slopes(point)]
+            made = [
+                _measured(noise.whiten(slopes), known)
+                for slopes, known in zip(self.slopes(point), self.known, strict=True)
+            ]
         self._rows.append((point, noise, made))
         return made
 
@@ -326,10 +356,10 @@ class Problem:
         known = self._known
         if known is not None and known[0].alike(point):
             at = known[0].vector()
-            if _moved_little(vector - at, noise, known[1]):
-                return _Normal.of(at, noise, known[1])
+            if _moved_little(vector - at, noise, known[1], self.known):
+                return _Normal.of(at, noise, known[1], self.known)
         self._known = (point, self.own_slopes(point))
-        return _Normal.of(vector, noise, self._known[1])
+        return _Normal.of(vector, noise, self._known[1], self.known)
 
     def profile(self, fit: Fit, k: int, values: Array) -> Array:
         """Return −2 log L at values (m,) of the free number k, the others following to first order.
@@ -404,21 +434,26 @@ class Problem:
         deviation of their own, lest the worst one speak for all.
         """
         if noise.coloured:
-            return [(n**2).sum(axis=1) + noise.log_det for n in nu]
-        sizes = [np.maximum((n**2).mean(axis=0), _LEAST_SIZE) for n in nu]
+            return [
+                (n**2).sum(axis=1) + known @ noise.log_sizes
+                for n, known in zip(nu, self.known, strict=True)
+            ]
+        counts = [np.maximum(known.sum(axis=0), 1) for known in self.known]
+        sizes = [
+            np.maximum((n**2).sum(axis=0) / count, _LEAST_SIZE)
+            for n, count in zip(nu, counts, strict=True)
+        ]
         return [
-            (n**2 / size).sum(axis=1) + float(np.log(size).sum()) + noise.log_det
-            for n, size in zip(nu, sizes, strict=True)
+            (n**2 / size).sum(axis=1) + known @ (np.log(size) + noise.log_sizes)
+            for n, size, known in zip(nu, sizes, self.known, strict=True)
         ]
 
     def costs(self, fit: Fit) -> Array:
         """Return −2 log L of each group of channels, (groups,)."""
-        nu = np.concatenate(fit.nu)
+        squares = (np.concatenate(fit.nu) ** 2).sum(axis=0)
+        of_channels = squares + self.counts * fit.noise.log_sizes
         return np.array(
-            [
-                float((nu[:, group.outputs] ** 2).sum()) + group.log_det * len(nu)
-                for group in fit.noise.groups
-            ]
+            [float(of_channels[list(group.outputs)].sum()) for group in fit.noise.groups]
         )
 
     def covariance(self, fit: Fit) -> tuple[Array, Array]:
@@ -438,7 +473,7 @@ class Problem:
     def _robust_covariance(self, fit: Fit) -> tuple[Array, Array]:
         rows = np.concatenate(self.rows(fit.point, fit.noise))
         nu = np.concatenate(fit.nu)
-        samples, _, q = rows.shape
+        samples, q = int(np.concatenate(self.known).any(axis=1).sum()), rows.shape[2]
         free = len(fit.point.places) + sum(map(len, fit.point.values))
         with np.errstate(over="ignore", invalid="ignore"):
             normal = np.einsum("kic,kid->cd", rows, rows)
@@ -471,14 +506,16 @@ class Problem:
     def noise_of(self, errors: Sequence[Array], point: Point, start: Noise | None = None) -> Noise:
         """Return what errors are weighed by."""
         if self.metric == "free run":
-            return free_run_noise(errors, self.groups, start)
-        return fit_noise(errors, self.poles(point), self.sample_time, self.groups, start)
+            return free_run_noise(errors, self.groups, start, self.known)
+        poles = self.poles(point)
+        return fit_noise(errors, poles, self.sample_time, self.groups, start, known=self.known)
 
     def forgetful(self, fit: Fit, longest: float) -> Fit:
         """Return the fit with the colour of its errors, which forgets after so many samples."""
         noise = fit_noise(
-            fit.errors, self.poles(fit.point), self.sample_time, self.groups, longest=longest
-        )
+            fit.errors, self.poles(fit.point), self.sample_time, self.groups, longest=longest,
+            known=self.known,
+        )  # fmt: skip
         nu, cost = self.whitened(noise, fit.errors)
         return replace(fit, noise=noise, nu=tuple(nu), cost=cost)
 

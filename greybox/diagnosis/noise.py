@@ -138,6 +138,14 @@ class Noise:
         """Of all groups."""
         return sum(g.log_det for g in self.groups)
 
+    @property
+    def log_sizes(self) -> Array:
+        """What each channel adds to `log_det`, (ny,)."""
+        out = np.zeros(sum(len(g.outputs) for g in self.groups))
+        for group in self.groups:
+            out[list(group.outputs)] = 2 * np.log(np.diag(group.root))
+        return out
+
 
 def _system(
     k: int, pole: ca.SX, sample_time: ca.SX, x: ca.SX, level: ca.SX
@@ -259,15 +267,27 @@ class Likelihood:
         (N, k) errors of each log.
     rest : tuple
         Scale of each channel (k,), what is left of its own error after a sample, sample time [s].
+    known : sequence of ndarray of bool, optional
+        (N, k) samples that count; a filter passes over the others. By default all.
     """
 
-    def __init__(self, parts: Sequence[Array], rest: tuple[Array, float, float]) -> None:
+    def __init__(
+        self,
+        parts: Sequence[Array],
+        rest: tuple[Array, float, float],
+        known: Sequence[NDArray[np.bool_]] | None = None,
+    ) -> None:
         self.rest, self.k = rest, parts[0].shape[1]
-        self.samples = sum(map(len, parts))
         # side by side, the ends together: a filter that rests passes zeros over
         self._errors = np.zeros((self.k, len(parts), max(map(len, parts))))
         for i, part in enumerate(parts):
             self._errors[:, i, -len(part) :] = part.T
+        counted = np.zeros(self._errors.shape, bool)
+        for i, part in enumerate(parts):
+            counted[:, i, -len(part) :] = True if known is None else known[i].T
+        self._known = counted.reshape(self.k, -1)
+        # numbers of each channel
+        self.counts = self._known.sum(axis=1)
         self._last: tuple[Array, _Filtered] | None = None
 
     def _at(self, x: Array) -> _Filtered:
@@ -292,7 +312,8 @@ class Likelihood:
         """Return −2 log L at x, and the price of a memory far from what is usual."""
         at = self._at(x)
         price = _PRIOR_WEIGHT * float(x[1] - _PRIOR) ** 2
-        return price + 2 * self.samples * float(at.logs.sum()) + float((at.nu**2).sum())
+        squares = float((at.nu**2).sum(where=self._known))
+        return price + 2 * float(self.counts @ at.logs) + squares
 
     def slopes(self, x: Array) -> tuple[Array, Array]:
         """Return the gradient (q,) and the Fisher information (q, q) of −2 log L at x."""
@@ -300,12 +321,13 @@ class Likelihood:
         slope_n, slope_d, slope_l = _transfer(
             self.k, np.array(_filter(self.k, True)(x, *self.rest))
         )
-        gradient = 2 * self.samples * slope_l.sum(axis=0)
-        information = 2 * self.samples * slope_l.T @ slope_l
+        gradient = 2 * self.counts @ slope_l
+        information = 2 * slope_l.T * self.counts @ slope_l
         past = at.past.reshape(-1, at.past.shape[2])
         own = self._past(at.nu, at.denominator)
         for i, nu in enumerate(at.nu):
             rows = slope_n[i].reshape(len(past), -1).T @ past - slope_d.T @ own[i]
+            rows *= self._known[i]
             gradient += 2 * rows @ nu
             information += 2 * rows @ rows.T
         gradient[1] += 2 * _PRIOR_WEIGHT * (x[1] - _PRIOR)
@@ -340,6 +362,7 @@ def fit_noise(
     groups: Sequence[tuple[int, ...]],
     start: Noise | None = None,
     longest: float = np.inf,
+    known: Sequence[NDArray[np.bool_]] | None = None,
 ) -> Noise:
     """Fit the colours by maximum likelihood.
 
@@ -357,13 +380,16 @@ def fit_noise(
         From which the search begins.
     longest : float
         Samples that what moves the ship beside the model is remembered at most.
+    known : sequence of ndarray of bool, optional
+        (N, ny) where each channel was measured; by default everywhere.
     """
     found, chosen = [], []
-    known = () if start is None else start.parameters
+    begun = () if start is None else start.parameters
     for g, group in enumerate(groups):
         x, colour = _fit_group(
             [e[:, list(group)] for e in errors], group, float(poles[group[0]]), sample_time,
-            known[g] if known else None, longest,
+            begun[g] if begun else None, longest,
+            None if known is None else [k[:, list(group)] for k in known],
         )  # fmt: skip
         found.append(colour)
         chosen.append(x)
@@ -410,7 +436,10 @@ def assumed_noise(
 
 
 def free_run_noise(
-    errors: Sequence[Array], groups: Sequence[tuple[int, ...]], start: Noise | None = None
+    errors: Sequence[Array],
+    groups: Sequence[tuple[int, ...]],
+    start: Noise | None = None,
+    known: Sequence[NDArray[np.bool_]] | None = None,
 ) -> Noise:
     """Return the metric of least squares: each state's errors in their own deviation.
 
@@ -426,18 +455,28 @@ def free_run_noise(
         As of `fit_noise`.
     start : Noise, optional
         Whose sensors' deviations are kept; by default those of third differences.
+    known : sequence of ndarray of bool, optional
+        (N, ny) where each channel was measured; by default everywhere.
     """
+    filled = errors
+    if known is not None:
+        errors = [np.where(k, e, np.nan) for k, e in zip(known, errors, strict=True)]
     every = np.concatenate(errors)
-    size = np.maximum(np.sqrt((every**2).mean(axis=0)), 1e-12)
+    counts = np.maximum((~np.isnan(every)).sum(axis=0), 1)
+    size = np.maximum(np.sqrt(np.nansum(every**2, axis=0) / counts), 1e-12)
+
+    def deviation(i: int) -> float:
+        # where no neighbours were measured, of the lines between those that were
+        found = (white_noise([e[:, i] for e in every]) for every in (errors, filled))
+        return max(next((f for f in found if f), 0.0), 1e-12)
+
     made = []
     for g, group in enumerate(groups):
         k = len(group)
         own = np.ones(k)
         own[0] = size[group[0]]
         sensor = (
-            np.array([max(white_noise([e[:, i] for e in errors]) or 0.0, 1e-12) for i in group])
-            if start is None
-            else start.groups[g].sensor
+            np.array([deviation(i) for i in group]) if start is None else start.groups[g].sensor
         )
         numerators = np.zeros((k, k, 1))
         numerators[0, 0, 0] = 1 / own[0]
@@ -452,6 +491,7 @@ def _fit_group(
     sample_time: float,
     start: Array | None,
     longest: float,
+    known: Sequence[NDArray[np.bool_]] | None,
 ) -> tuple[Array, NoiseModel]:
     """Return the logarithms and memory of one group, and its innovations form."""
     k = len(group)
@@ -466,7 +506,7 @@ def _fit_group(
     bounds = np.array([_SHARE, memory, *[_LEVEL] * k])
     firsts = [np.array([*s, *np.zeros(k)]) for s in _STARTS] if start is None else [start]
     most = _MOST_STEPS if start is None else _NEAR_STEPS
-    likelihood = Likelihood(parts, rest)
+    likelihood = Likelihood(parts, rest, known)
     found = [_minimised(likelihood, x0, bounds, most) for x0 in firsts]
     x = min(found, key=lambda item: item[0])[1]
     return x, _colour(group, rest, x)

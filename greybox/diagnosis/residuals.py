@@ -40,12 +40,13 @@ def residual_tests(
 
     References
     ----------
-    Ljung and Box (1978).
+    Ljung and Box (1978); Stoffer and Toloi (1992), where samples are missing.
     """
-    errors = np.concatenate(fit.errors)
+    errors, known = np.concatenate(fit.errors), np.concatenate(problem.known)
     out = [
-        _whiteness(name, errors[:, i]) for i, name in enumerate(problem.structure.states)
-    ]  # fmt: skip
+        _whiteness(name, errors[:, i], known[:, i])
+        for i, name in enumerate(problem.structure.states)
+    ]
     free = left.proof.p_value > _LEVEL
     z = left.proof.gain / left.proof.std if left.proof.std > 0 else 0.0
     out.append(
@@ -82,12 +83,15 @@ def residual_tests(
     return tuple(out)
 
 
-def _whiteness(name: str, e: Array) -> TestResult:
-    e = e - e.mean()
+def _whiteness(name: str, e: Array, known: NDArray[np.bool_] | None = None) -> TestResult:
+    known = np.ones(len(e), bool) if known is None else known
+    n = int(known.sum())
+    e = np.where(known, e - e[known].sum() / max(n, 1), 0.0)
     energy = max(float(e @ e), 1e-300)
-    rho = np.array([float(e[k:] @ e[:-k]) / energy for k in range(1, _LAGS + 1)])
-    n = len(e)
-    statistic = n * (n + 2) * float((rho**2 / (n - np.arange(1, _LAGS + 1))).sum())
+    lags = range(1, _LAGS + 1)
+    rho = np.array([float(e[k:] @ e[:-k]) / energy for k in lags])
+    pairs = np.maximum([int((known[k:] & known[:-k]).sum()) for k in lags], 1)
+    statistic = n * (n + 2) * float((rho**2 / pairs).sum())
     null = Distribution("chi2", (float(_LAGS),))
     p = null.sf(statistic)
     return TestResult(

@@ -13,6 +13,7 @@ from greybox.diagnosis.evidence.omnibus import Omnibus, disagreement, omnibus
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain, file_word
 from greybox.diagnosis.search import Candidate, Search
+from greybox.diagnosis.ship import LogRun
 from greybox.diagnosis.symptoms import coloured, word
 from greybox.diagnosis.thresholds import (
     APART,
@@ -145,7 +146,7 @@ def _wrong(
     base: Fit, final: Fit, pairs: Sequence[Pair], left: Omnibus, explained: float, found: bool
 ) -> str:
     """Return what is wrong with what a model leaves; nothing where nothing is."""
-    numbers = sum(nu.size for pair in pairs for nu in pair.held_fit.nu)
+    numbers = sum(int(pair.held.counts.sum()) for pair in pairs)
     if left.proof.p_value < SURE and left.gain > max(WORTH * numbers, LEFT_OVER * explained):
         return (
             f"forces that belong to no known cause would explain another "
@@ -179,8 +180,7 @@ def _other_coefficients(given: Sequence[Pair], anew: Sequence[Pair]) -> str:
     )
     count = len(given[0].held.structure.states)
     squares = [
-        sum((e[:, :count] ** 2).sum(axis=0) for p in pairs for e in p.held_fit.errors)
-        for pairs in (given, anew)
+        sum(p.held.squares(p.held_fit.errors)[:count] for p in pairs) for pairs in (given, anew)
     ]
     fall = 1 - float(np.min(squares[1] / np.maximum(squares[0], 1e-300)))
     proof = proof_of(one - two)
@@ -216,12 +216,20 @@ def _no_prediction(pairs: Sequence[Pair]) -> str:
 def _against_constant(pairs: Sequence[Pair]) -> dict[str, float]:
     """Return the squared held-out error of each state in the variance of its motion."""
     names = pairs[0].problem.structure.states
-    errors = np.concatenate([e for p in pairs for e in p.held_fit.errors])
-    moved = np.concatenate([run.y - run.y.mean(axis=0) for p in pairs for run in p.held.runs])
-    return {
-        s: float((errors[:, i] ** 2).sum() / max((moved[:, i] ** 2).sum(), 1e-300))
-        for i, s in enumerate(names)
-    }
+    errors, moved = (
+        np.sum([p.held.squares(of) for p, of in zip(pairs, every, strict=True)], axis=0)
+        for every in (
+            [p.held_fit.errors for p in pairs],
+            [[_about_mean(run) for run in p.held.runs] for p in pairs],
+        )
+    )
+    return {s: float(errors[i] / max(moved[i], 1e-300)) for i, s in enumerate(names)}
+
+
+def _about_mean(run: LogRun) -> Array:
+    """Return what was measured less its mean, (N, ny)."""
+    counts = np.maximum(run.known.sum(axis=0), 1)
+    return np.asarray(run.y - run.y.sum(axis=0, where=run.known) / counts)
 
 
 def _missed(pairs: Sequence[Pair]) -> dict[str, float]:
@@ -230,10 +238,9 @@ def _missed(pairs: Sequence[Pair]) -> dict[str, float]:
     names = pairs[0].problem.runs[0].outputs
     for k, group in enumerate(pairs[0].held_fit.noise.groups):
         i = group.outputs[0]
-        total = sum(float((e[:, i] ** 2).sum()) for p in pairs for e in p.held_fit.errors)
+        total = sum(float(p.held.squares(p.held_fit.errors)[i]) for p in pairs)
         noise = sum(
-            float(p.held_fit.noise.groups[k].sensor[0] ** 2) * sum(map(len, p.held_fit.errors))
-            for p in pairs
+            float(p.held_fit.noise.groups[k].sensor[0] ** 2) * p.held.counts[i] for p in pairs
         )
         out[names[i]] = float(np.sqrt(total / max(noise, 1e-300)))
     return out
@@ -270,7 +277,9 @@ def _excess(fit: Fit, final: Fit) -> float:
 
 def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> str:
     problem = pairs[0].problem
-    moved = coloured(problem.forgetful(final, np.inf), problem.runs[0].outputs)
+    # of the logs that it was fitted to, or of the first part of them
+    fit = final if pairs[0].fit.escaped else problem.forgetful(pairs[0].fit, np.inf)
+    moved = coloured(fit, problem.runs[0].outputs)
     tail = f" In these logs {moved}." if moved else ""
     if why:
         return f"What is left is not only noise: {why}.{tail}"

@@ -152,7 +152,9 @@ class LogRun:
         self.states = structure.states
         self._turns = "r" in self.states and "psi" in log
         self.outputs = (*self.states, "psi") if self._turns else self.states
-        self._gaps = [(i, ~log.missing[n]) for i, n in enumerate(self.outputs) if n in log.missing]
+        # where each output was measured, (N, ny)
+        self.known = np.column_stack([log.known((n,)) for n in self.outputs])
+        self._gaps = [i for i, measured in enumerate(self.known.T) if not measured.all()]
         self.y = self._across_gaps(np.column_stack([log[n] for n in self.outputs]))
         self.heading = log["psi"] if "psi" in log else np.zeros(len(log))
         self._psi = held(self.heading, integrator)
@@ -255,7 +257,8 @@ class LogRun:
 
         So the error there is what lies between those beside it, and surprises no filter.
         """
-        for i, known in self._gaps:
+        for i in self._gaps:
+            known = self.known[:, i]
             k, rows = np.flatnonzero(known), np.flatnonzero(~known)
             if not len(k):
                 y[:, i] = 0.0

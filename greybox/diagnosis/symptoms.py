@@ -46,11 +46,14 @@ def find_symptoms(problem: Problem, fit: Fit) -> list[Symptom]:
         outputs[i]: float(s)
         for g in fit.noise.groups for i, s in zip(g.outputs, g.sensor, strict=True)
     }  # fmt: skip
-    errors = np.concatenate(fit.errors)
+    errors, measured = np.concatenate(fit.errors), np.concatenate(problem.known)
     conditions = _joined(problem, fit)
     out: list[Symptom] = []
     for i, name in enumerate(problem.structure.states):
-        e, unit = errors[:, i], CHANNELS[name].unit if name in CHANNELS else ""
+        known = measured[:, i]
+        if not known.any():
+            continue
+        e, unit = errors[known, i], CHANNELS[name].unit if name in CHANNELS else ""
         rms = float(np.sqrt((e**2).mean()))
         ratio = rms / max(sensor[name], 1e-300)
         if ratio > 1.15:
@@ -63,7 +66,7 @@ def find_symptoms(problem: Problem, fit: Fit) -> list[Symptom]:
             )  # fmt: skip
         found: list[tuple[float, str]] = []
         for text, mask in conditions:
-            here = e[mask]
+            here = e[mask[known]]
             if len(here) < max(_SHARE * len(e), 20) or len(here) > (1 - _SHARE) * len(e):
                 continue
             mean = float(here.mean())

@@ -11,6 +11,7 @@ from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.null_model import clocks_of
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.ship import Ship
+from greybox.diagnosis.symptoms import find_symptoms
 from greybox.errors import LogError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.run.changes import Change, factors_at
@@ -124,3 +125,29 @@ def test_logs_are_taken_at_the_sample_time_of_the_model(modelled, monkeypatch) -
         LogError, match=r"the model's sample time is 0.5 s and 'estimation' has 1 s"
     ):
         diagnose([trial.estimation], validate=[trial.validation], model=fast)
+
+
+def test_what_was_not_measured_does_not_count() -> None:
+    trial = draw(np.random.default_rng([77, 1]), (), samples=600, positions=False)
+    log = trial.estimation
+    kept = np.arange(len(log)) % 30 < 12
+    lines = {n: np.interp(log.t, log.t[kept], log[n][kept]) for n in ("u", "v")}
+    sparse = replace(
+        log, channels={**log.channels, **lines}, missing=dict.fromkeys(("u", "v"), ~kept)
+    )
+    ready = prepare([sparse], [], None, "thesis", ["side_force"])
+    fit = ready.base()
+    problem = ready.case.problem(fit.integrator)
+    assert problem.counts.tolist() == [240, 240, 600, 600]
+    sensor = [float(g.sensor[0]) for g in fit.noise.groups]
+    # straight lines have no noise: with them it would be 0.009
+    assert sensor == pytest.approx([0.01414] * 3, rel=0.15)
+    assert not np.concatenate(fit.nu)[~kept, :2].any()
+    added = np.concatenate(problem.contributions(fit))
+    assert added.sum() == pytest.approx(fit.cost)
+    assert problem.costs(fit).sum() == pytest.approx(fit.cost)
+    # residuals, symptoms and shares of the error are of measured samples alone
+    squares = (fit.errors[0][kept, 0] ** 2).sum()
+    assert problem.squares(fit.errors)[0] == pytest.approx(squares)
+    told = [s.sentence for s in find_symptoms(problem, fit)]
+    assert not any("times what its sensor's noise explains" in sentence for sentence in told)
