@@ -27,7 +27,7 @@ from greybox.diagnosis.evidence.features import through_water
 from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.extension import noise_levels, one_step_deviations
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.gain import gains, run_on
+from greybox.diagnosis.gain import gains, runs_on
 from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.result import Diagnosis, Gain, Remainder
@@ -166,8 +166,7 @@ def with_remainder(
         return replace(told, remainder=replace(found, reason=reason))
     model = extended_by(told.model, terms, made)
     if validate:
-        one = [run_on(told.model, log) for log in validate]
-        two = [run_on(model, log) for log in validate]
+        one, two = runs_on(told.model, validate), runs_on(model, validate)
     else:
         pairs = case.held_out(fit.integrator).pairs(fit)
         one, two = held_runs(pairs), held_runs([_beside(wide, p, terms) for p in pairs])
@@ -228,14 +227,15 @@ def wider(case: DiagnosisProblem, terms: Sequence[Term]) -> DiagnosisProblem:
     """Return a case with bumps among the terms of its universe."""
     return DiagnosisProblem(
         case.structure, case.universe.with_terms(*terms), case.logs, case.held_out_logs,
-        case.kind, case.regime, case.metric,
+        case.kind, case.regime, case.metric, case.clocks,
     )  # fmt: skip
 
 
 def _wider(problem: Problem, structure: Structure) -> Problem:
     """Return the logs ready to be explained by a structure with more terms."""
     runs = [
-        LogRun(structure, r.log, r.integrator, float(r.log.t[0] - r.time[0])) for r in problem.runs
+        LogRun(structure, r.log, r.integrator, float(r.log.t[0] - r.time[0]), r.duration)
+        for r in problem.runs
     ]
     return Problem(runs, problem.metric)
 

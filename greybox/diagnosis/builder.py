@@ -25,7 +25,7 @@ from greybox.diagnosis.evidence.remainder import generic_force
 from greybox.diagnosis.evidence.standing import standing
 from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.gain import gains, run_on
+from greybox.diagnosis.gain import gains, run_on, runs_on
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.null_model import FOLDS, DiagnosisProblem
 from greybox.diagnosis.point import Fit, Point
@@ -298,8 +298,9 @@ class DiagnosisBuilder:
         logs = list(validate)
         if logs:
             later = _likelier_story(after, logs)
-            one = [run_on(before, log) for log in logs]
-            two = [self._as_seen(run_on(later, log), log, final) for log in logs]
+            one = runs_on(before, logs)
+            seen = zip(runs_on(later, logs), logs, strict=True)
+            two = [self._as_seen(run, log, final) for run, log in seen]
         else:
             later, pairs = after, self.case.held_out(first.integrator).pairs(first)
             one = held_runs(pairs)
@@ -314,8 +315,7 @@ class DiagnosisBuilder:
                 _as_shown(a, b),
             )
             for held, ones, twos in (
-                (False, [run_on(before, log) for log in self.case.logs],
-                 [run_on(after, log) for log in self.case.logs]),
+                (False, runs_on(before, self.case.logs), runs_on(after, self.case.logs)),
                 (True, one, two),
             )
             for a, b in zip(ones, twos, strict=True)
@@ -456,7 +456,7 @@ def _likelier_story(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> Manoeu
         return sum(
             float(np.nansum((run.log.measured(s) - run.x[:, i]) ** 2))
             / max(float(np.var(run.log[s])), 1e-12)
-            for run in (run_on(candidate, log) for log in logs)
+            for run in runs_on(candidate, logs)
             for i, s in enumerate(run.fit)
         )
 

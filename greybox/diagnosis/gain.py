@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.diagnosis.null_model import clocks_of
 from greybox.diagnosis.result import Gain
 from greybox.model.model import ManoeuvringModel
 from greybox.trial.convert.sensor_corrections import correct_log
@@ -24,7 +25,15 @@ _WORST = 100.0
 
 def run_on(model: ManoeuvringModel, log: TrialLog) -> LogFit:
     """Run a model on a log as its vessel file reads it."""
-    return run_model(model, correct_log(log, model.vessel))
+    return runs_on(model, [log])[0]
+
+
+def runs_on(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> list[LogFit]:
+    """Run a model on each log, its changes by the clock of the log that each is a segment of."""
+    return [
+        run_model(model, correct_log(log, model.vessel), first=float(log.t[0]) - origin)
+        for log, (origin, _) in zip(logs, clocks_of(logs), strict=True)
+    ]
 
 
 def gains(

@@ -26,7 +26,7 @@ from greybox.numerics.parallel import map_forked
 from greybox.regression.regression import build_regression
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.log import TrialLog
-from greybox.trial.segments import whole_name
+from greybox.trial.segments import continues
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ def clocks_of(logs: Sequence[TrialLog]) -> list[Clock]:
     wholes: list[list[TrialLog]] = []
     for log in logs:
         before = wholes[-1][-1] if wholes else None
-        if before is not None and _follows(before, log):
+        if before is not None and continues(before, log):
             wholes[-1].append(log)
         else:
             wholes.append([log])
@@ -65,15 +65,6 @@ def clocks_of(logs: Sequence[TrialLog]) -> list[Clock]:
         for parts in wholes
         for _ in parts
     ]
-
-
-def _follows(before: TrialLog, log: TrialLog) -> bool:
-    """Whether a log is a later segment of the one that another one is a segment of."""
-    return (
-        whole_name(before.name) == whole_name(log.name) != log.name
-        and before.provenance == log.provenance
-        and bool(before.t[-1] < log.t[0])
-    )
 
 
 class DiagnosisProblem:

@@ -235,7 +235,7 @@ def _score_changes(directions: ProjectedScores, hypotheses: Sequence[Hypothesis]
     if not hypotheses:
         return []
     ship = point.ship
-    least = min(run.time[-1] for run in problem.runs)
+    least = min(run.duration for run in problem.runs)
     moments = np.linspace(0.05, 0.95, MOMENTS) * least
     names = [a.parameters[0].name.removesuffix("_factor") for a in hypotheses]
     index = np.array([problem.structure.index(n) for n in names])

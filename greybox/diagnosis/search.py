@@ -298,7 +298,7 @@ def _completed(
 def _left_to_motion(case: DiagnosisProblem, fit: Fit) -> bool:
     """Whether a force of motion and commands would explain more than a deviation to be told."""
     pairs = case.held_out(fit.integrator).pairs(fit)
-    numbers = sum(nu.size for pair in pairs for nu in pair.held_fit.nu)
+    numbers = sum(int(pair.held.counts.sum()) for pair in pairs)
     left = omnibus(pairs, MOTION_AND_COMMANDS)
     return left.proof.p_value < SURE and left.gain > WORTH * numbers
 

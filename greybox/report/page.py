@@ -133,7 +133,8 @@ _TEMPLATE = """{% macro drawn(picture) %}{% set chart = chart_of(picture) %}
 {% endmacro %}
 {% macro numbers(of) %}
 {% for table in of.tables %}<div class="wide"><table
-{%- if table.sentences %} class="sentences"{% endif %}><caption><span>{{ table.caption }}</span></caption>
+{%- if table.sentences %} class="sentences"{% endif %}>
+<caption><span>{{ table.caption }}</span></caption>
 <thead><tr>{% for cell in table.header %}<th scope="col">{{ cell }}</th>{% endfor %}</tr></thead>
 <tbody>{% for row in table.rows %}<tr>{% for cell in row %}<td
 {%- if table.sentences and 0 < loop.index0 < row | length - 1 %} data-name="

@@ -74,6 +74,15 @@ def join_segments(segments: Sequence[TrialLog], name: str) -> TrialLog:
     )
 
 
+def continues(before: TrialLog, log: TrialLog) -> bool:
+    """Whether a log is a later segment of the one that another one is a segment of."""
+    return (
+        whole_name(before.name) == whole_name(log.name) != log.name
+        and before.provenance == log.provenance
+        and bool(before.t[-1] < log.t[0])
+    )
+
+
 def whole_name(name: str) -> str:
     """Return the name of the log of which `split_segments` named a segment, others as they are."""
     return _SEGMENT.sub("", name)

@@ -23,10 +23,10 @@ from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import (
     LogGaps,
+    continues,
     find_log_gaps,
     join_segments,
     split_segments,
-    whole_name,
 )
 
 if TYPE_CHECKING:
@@ -200,6 +200,7 @@ def run_model(
     log: TrialLog,
     *,
     heading: Literal["measured", "simulated"] = "measured",
+    first: float = 0.0,
 ) -> LogFit:
     """Run a model freely on a log and compare.
 
@@ -213,6 +214,8 @@ def run_model(
     model : ManoeuvringModel
     log : TrialLog
     heading : {"measured", "simulated"}
+    first : float
+        Time of the log's first sample on the clock of the model's changes [s].
 
     Returns
     -------
@@ -229,7 +232,7 @@ def run_model(
             use_wind=part.has_wind,
             integrator=model.integrator,
             changes=model.changes,
-            first=float(part.t[0] - log.t[0]),
+            first=first + float(part.t[0] - log.t[0]),
         )
         for part in split_segments(log)
     ]
@@ -336,13 +339,7 @@ def by_log(fits: Sequence[LogFit]) -> list[list[LogFit]]:
     """Group the runs on neighbouring segments of one log."""
     groups: list[list[LogFit]] = []
     for run in fits:
-        before = groups[-1][-1].log if groups else None
-        if (
-            before is not None
-            and whole_name(before.name) == whole_name(run.log.name) != run.log.name
-            and before.provenance == run.log.provenance
-            and before.t[-1] < run.log.t[0]
-        ):
+        if groups and continues(groups[-1][-1].log, run.log):
             groups[-1].append(run)
         else:
             groups.append([run])

@@ -100,7 +100,8 @@ def test_causes_that_take_each_others_place_end_the_search(
     )
     steps = []
 
-    def take(case, fit, causes, hypotheses):
+    def take(case, fit, causes, hypotheses, passed_over):
+        assert passed_over == 0
         steps.append([c.hypothesis.key for c in causes])
         taken = two if causes and causes[0].hypothesis.key == "a" else one
         return Step(fit, (), (taken,), taken)

@@ -115,7 +115,7 @@ def test_in_the_mirror_of_port_and_starboard_each_feature_becomes_its_image() ->
         log.vessel = vessel
         run = SimpleNamespace(
             states=("u", "v", "r"), log=log, run=lambda *_: SimpleNamespace(x=x * sign),
-            forces=lambda *_: tau * sign, sample_time=0.5, time=np.arange(n),
+            forces=lambda *_: tau * sign, sample_time=0.5, time=np.arange(n), duration=n - 1,
             structure=SimpleNamespace(inputs=("taux", "tauy", "taun")),
         )  # fmt: skip
         return features(run, fit, x[0], np.full((3, 1), 0.5))

@@ -135,7 +135,7 @@ def features(run: LogRun, fit: Fit, start: Array, knots: Array) -> Features:
         add(np.sin(k * psi), 0, HEADING)
     add(states[0] * np.cos(psi), 0, HEADING)
     add(states[0] * np.sin(psi), 0, HEADING)
-    later = run.time > run.time[-1] / 2
+    later = run.time > run.duration / 2
     for column, sign in zip((*states, *tau.T), (*own_signs, *forces), strict=True):
         add(later * column, sign, TIME)
     return Features(
