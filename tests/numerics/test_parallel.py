@@ -172,8 +172,10 @@ def test_what_a_dead_worker_had_is_computed_again_but_not_for_ever(tmp_path):
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_no_worker_outlives_the_first_process(tmp_path, how):
     first = subprocess.Popen(
-        [sys.executable, "-c", LONG, str(tmp_path)], stderr=subprocess.PIPE, text=True
-    )
+        [sys.executable, "-c", LONG, str(tmp_path)], stderr=subprocess.PIPE, text=True,
+        # tests in the background of a shell ignore Ctrl-C, and so would what they start
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
     _until(lambda: len(list(tmp_path.iterdir())) == 2)
     workers = [int(path.name) for path in tmp_path.iterdir()]
     first.send_signal(how)
