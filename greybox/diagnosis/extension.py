@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.point import Fit
+from greybox.diagnosis.quantities import numbers_by_true_north
 from greybox.diagnosis.ship import CURRENTS, Sensors, Wire
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
@@ -68,7 +69,8 @@ def extended_model(
     """
     wide = extended_structure(structure, problem, fit)
     ship = fit.point.ship
-    covariance = problem.covariance(fit)[1] + misfit
+    numbers, covariance = numbers_by_true_north(problem, fit)
+    covariance = covariance + misfit
     where = {problem.names[i]: k for k, i in enumerate(fit.point.places)}
     theta = np.array([ship.theta[problem.place(n)] for n in wide.parameters])
     index = [where.get(n) for n in wide.parameters]
@@ -78,10 +80,10 @@ def extended_model(
             if a is not None and b is not None:
                 full[i, j] = covariance[a, b]
     disturbances = dict(known_current)
-    for k, name in enumerate(CURRENTS):
+    for name in CURRENTS:
         if name in where:
             i = where[name]
-            disturbances[name] = (float(ship.current[k]), float(np.sqrt(covariance[i, i])))
+            disturbances[name] = (float(numbers[i]), float(np.sqrt(covariance[i, i])))
     names = problem.structure.parameters
     means = [where[n] for n in disturbances] if set(disturbances) <= set(where) else []
     beside = np.array([np.zeros(len(covariance)) if i is None else covariance[i] for i in index])

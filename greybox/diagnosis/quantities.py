@@ -3,11 +3,34 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import Quantity
 from greybox.diagnosis.search import Candidate
+from greybox.diagnosis.ship import CURRENTS
+from greybox.rotation import ned_to_body
+
+Array = NDArray[np.float64]
+
+
+def numbers_by_true_north(problem: Problem, fit: Fit) -> tuple[Array, Array]:
+    """Return the free numbers of a fit but the starts, and their covariance.
+
+    Simulated ships follow the logged heading: where its compass is biased, the current is
+    estimated in the compass's frame, and is turned from there.
+    """
+    values, covariance = problem.covariance(fit)
+    names = [problem.names[i] for i in fit.point.places]
+    bias = fit.point.ship.sensors.turned
+    if not bias or not set(CURRENTS) <= set(names):
+        return values, covariance
+    where = [names.index(n) for n in CURRENTS]
+    turn = np.eye(len(values))
+    north, east = np.eye(2)
+    turn[np.ix_(where, where)] = np.array(ned_to_body(north, east, bias))
+    return turn @ values, turn @ covariance @ turn.T
 
 
 def quantities_of(problem: Problem, candidate: Candidate, fit: Fit) -> dict[str, Quantity]:
@@ -15,7 +38,7 @@ def quantities_of(problem: Problem, candidate: Candidate, fit: Fit) -> dict[str,
     hypothesis, weighed = candidate.hypothesis, candidate.standing
     if candidate.told is not None:
         return dict(candidate.told)
-    values, covariance = problem.covariance(fit)
+    values, covariance = numbers_by_true_north(problem, fit)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if hypothesis.apply is None:
         index = [fit.point.places.index(problem.place(n)) for n in hypothesis.columns]

@@ -11,6 +11,7 @@ from designs import thesis_model
 from virtual import virtual_log
 
 from greybox.diagnosis.causes import known_causes
+from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.evidence.held_out import proof_of
 from greybox.diagnosis.gain import gains
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
@@ -152,3 +153,17 @@ def test_all_causes_count_as_tried_though_only_some_are_left() -> None:
     found = search(ready.case, ready.base(), ready.hypotheses, alone=False)
     assert found.causes
     assert found.tried == len(ready.hypotheses)
+
+
+@pytest.mark.long
+def test_a_current_beside_a_biased_compass_is_told_by_true_north() -> None:
+    effects = ("current", "heading_bias")
+    trial = draw(np.random.default_rng([55, 1]), effects, samples=900, positions=False)
+    options = DiagnosisOptions(causes=list(effects), own_pace=False)
+    found = diagnose([trial.estimation], validate=[trial.validation], options=options)
+    truth = {name: v for effect in trial.truth for name, v in effect.parameters.items()}
+    told = {name: q for cause in found.causes for name, q in cause.parameters.items()}
+    for name in ("heading_bias", "current_north", "current_east"):
+        assert abs(told[name].value - float(truth[name])) < 4 * told[name].std
+    for name, (value, _) in found.model.disturbances.items():
+        assert value == pytest.approx(told[name].value)
