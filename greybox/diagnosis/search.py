@@ -331,6 +331,7 @@ def take_step(
         ),
         key=_bic,
     )
+    candidates = _beside_others(candidates)
     sure = (_wald_checked(case, c) for c in candidates if c.holds)
     taken = next((c for c in sure if c.holds), None)
     if taken is not None:
@@ -339,6 +340,21 @@ def take_step(
         if not taken.holds:
             taken = None
     return Step(fit, tuple(scores), tuple(candidates), taken)
+
+
+def _beside_others(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return candidates whose proof, where they hold a run within bounds, is that few others do.
+
+    What no sum tells is told by rank: the p-value is the share of the other causes that hold the
+    run as well.
+    """
+    every = {c.hypothesis.cause for c in candidates}
+    holding = {c.hypothesis.cause for c in candidates if c.proof.gain == np.inf}
+    share = (len(holding) - 1) / max(len(every) - 1, 1)
+    return [
+        replace(c, proof=replace(c.proof, p_value=share)) if c.proof.gain == np.inf else c
+        for c in candidates
+    ]
 
 
 def _wald_checked(case: DiagnosisProblem, candidate: Candidate) -> Candidate:
@@ -495,7 +511,7 @@ def weighed(case: DiagnosisProblem, found: Search) -> Search:
         if not fallen:
             if not waiting:
                 break
-            stood += _stood(case, fit, waiting, found.tried)
+            stood += _stood(case, fit, waiting, found)
             waiting = []
             continue
         least, without = min(fallen, key=lambda item: _beyond(item[0]))
@@ -510,7 +526,7 @@ def weighed(case: DiagnosisProblem, found: Search) -> Search:
         fit = case.problem(fit.integrator).settle(without, SETTLE)
         waiting += [cause for cause, _ in stood if _stands(cause)]
         others = [cause for cause, _ in stood if not _stands(cause)]
-        stood = _stood(case, fit, others, found.tried)
+        stood = _stood(case, fit, others, found)
     return replace(
         found,
         final=fit,
@@ -526,11 +542,13 @@ def _as_found(found: Search, causes: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _stood(
-    case: DiagnosisProblem, fit: Fit, causes: Sequence[Candidate], tried: int
+    case: DiagnosisProblem, fit: Fit, causes: Sequence[Candidate], found: Search
 ) -> list[tuple[Candidate, Fit]]:
     """Return causes with what each does beside a generic force, and the fits without them.
 
-    Those whose numbers are told already stand, and come with the fit as it is.
+    Those whose numbers are told already stand, and come with the fit as it is. Where the fit
+    without a cause leaves every bound and that without any cause does not, a better one exists
+    and was not found: what the cause does cannot be weighed.
     """
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     pairs = held_out.pairs(fit)
@@ -541,21 +559,22 @@ def _stood(
             contributions_beside(pair)
         problem.covariance(fit)
 
-    def work(k: int) -> tuple[Fit, tuple[Standing, Proof]]:
+    def work(k: int) -> tuple[Fit, tuple[Standing | None, Proof]]:
         without = _without(problem, fit, asked[k])
-        hypothesis = asked[k].hypothesis
-        weight = standing(problem, hypothesis, fit, pairs, held_out.pairs(without), tried)
+        hypothesis, weight = asked[k].hypothesis, None
+        if found.base.escaped or not without.escaped:
+            weight = standing(problem, hypothesis, fit, pairs, held_out.pairs(without), found.tried)
         return without, (weight, held_out.prove(without, fit))
 
     rest = [problem.drop(fit.point, c.hypothesis) for c in asked]
-    found = iter(on_all_processors(rest, work))
+    weighed_now = iter(on_all_processors(rest, work))
     out = []
     for cause in causes:
         if cause.told is not None:
             out.append((cause, fit))
             continue
-        without, (weight, proof) = next(found)
-        alone = assess_candidate(proof, without, fit, cause.hypothesis, tried, cause.names)
+        without, (weight, proof) = next(weighed_now)
+        alone = assess_candidate(proof, without, fit, cause.hypothesis, found.tried, cause.names)
         alone = _wald_checked(case, replace(alone, standing=weight))
         out.append((alone, without))
     return out
