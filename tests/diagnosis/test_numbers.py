@@ -17,7 +17,7 @@ from greybox.diagnosis.gain import gains
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import context_of, prepare
 from greybox.diagnosis.result import Found, Quantity
-from greybox.diagnosis.search import freed, search
+from greybox.diagnosis.search import Candidate, _beside_others, freed, search
 from greybox.model.terms import mirror_sign, parse_term
 from greybox.study.blind import draw
 from greybox.trial.segments import join_segments, split_segments
@@ -167,3 +167,14 @@ def test_a_current_beside_a_biased_compass_is_told_by_true_north() -> None:
         assert abs(told[name].value - float(truth[name])) < 4 * told[name].std
     for name, (value, _) in found.model.disturbances.items():
         assert value == pytest.approx(told[name].value)
+
+
+def test_a_run_that_many_causes_hold_within_bounds_is_no_proof_of_one() -> None:
+    def held(cause: str, gain: float) -> Candidate:
+        hypothesis = Hypothesis(cause, cause, (), ())
+        return Candidate(hypothesis, None, 1.0, 0.0, 0.0, proof_of(np.full(3, gain)))
+
+    many = [held("a", np.inf), held("b", np.inf), held("c", np.inf), held("d", -np.inf)]
+    assert [c.proof.p_value for c in _beside_others(many)] == [2 / 3, 2 / 3, 2 / 3, 1.0]
+    alone = [held("a", np.inf), held("b", -np.inf)]
+    assert _beside_others(alone)[0].proof.p_value == 0.0
