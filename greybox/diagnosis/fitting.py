@@ -66,14 +66,10 @@ class _Normal:
     matrix: Array
 
     @classmethod
-    def of(cls, at: Array, noise: Noise, slopes: Sequence[_Own], known: Sequence[Mask]) -> _Normal:
+    def of(cls, at: Array, rows: tuple[_Own, ...]) -> _Normal:
         matrix = np.zeros((len(at), len(at)))
         # of a run at the edge of stability the derivatives may leave every number's range
         with np.errstate(over="ignore", invalid="ignore"):
-            rows = tuple(
-                (_measured(noise.whiten(slope), seen), where)
-                for (slope, where), seen in zip(slopes, known, strict=True)
-            )
             for own, where in rows:
                 by_channel = own.transpose(1, 2, 0)
                 matrix[np.ix_(where, where)] += sum(r @ r.T for r in by_channel)
@@ -94,19 +90,9 @@ class _Normal:
             return bool(away @ self.matrix @ away < _NEAR)
 
 
-def _measured(e: Array, known: Mask) -> Array:
+def measured(e: Array, known: Mask) -> Array:
     """Return innovations (N, ny, m), zero where nothing was measured."""
     return e if known.all() else np.where(known[:, :, None], e, 0.0)
-
-
-def _moved_little(away: Array, noise: Noise, slopes: Sequence[_Own], known: Sequence[Mask]) -> bool:
-    """Whether derivatives do for a vector so far away, too: `_Normal.near` without a matrix."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        moved = [np.matmul(away[where], own.transpose(1, 2, 0)).T for own, where in slopes]
-        white = (
-            _measured(noise.whiten(m[:, :, None]), k) for m, k in zip(moved, known, strict=True)
-        )
-        return bool(sum((m**2).sum() for m in white) < _NEAR)
 
 
 class Problem:
@@ -226,25 +212,26 @@ class Problem:
         """Return innovations, zero where nothing was measured, and −2 log L of errors."""
         if not all(np.isfinite(e).all() for e in errors):
             return [], np.inf
-        nu = [
-            _measured(noise.whiten(e[:, :, None]), known)[:, :, 0]
-            for e, known in zip(errors, self.known, strict=True)
-        ]
+        nu = [n[:, :, 0] for n in self.whiten(noise, [e[:, :, None] for e in errors])]
         with np.errstate(over="ignore"):
             cost = sum(float((n**2).sum()) for n in nu)
         return nu, cost + float(self.counts @ noise.log_sizes)
+
+    def whiten(self, noise: Noise, columns: Sequence[Array]) -> list[Array]:
+        """Return columns (N, ny, m) of each log whitened, zero where nothing was measured."""
+        # of a run at the edge of stability the derivatives may leave every number's range
+        with np.errstate(over="ignore", invalid="ignore"):
+            return [
+                measured(noise.whiten(c), known)
+                for c, known in zip(columns, self.known, strict=True)
+            ]
 
     def rows(self, point: Point, noise: Noise) -> list[Array]:
         """Return whitened derivatives of the outputs in the free numbers, (N, ny, q) per log."""
         for at, weighed_by, found in self._rows:
             if at is point and weighed_by is noise:
                 return found
-        # of a run at the edge of stability the derivatives may leave every number's range
-        with np.errstate(over="ignore", invalid="ignore"):
-            made = [
-                _measured(noise.whiten(slopes), known)
-                for slopes, known in zip(self.slopes(point), self.known, strict=True)
-            ]
+        made = self.whiten(noise, self.slopes(point))
         self._rows.append((point, noise, made))
         return made
 
@@ -349,17 +336,31 @@ class Problem:
             # as long as −2 log L falls as promised, the derivatives serve
             if not (normal.near(vector) or (abs(fell / promise - 1) < _AS_PROMISED and not little)):
                 normal = None
-        return Fit(point, noise, cost, tuple(nu), tuple(errors), converged, self.runs[0].integrator)
+        return Fit(
+            point, noise, cost, tuple(nu), tuple(errors), converged, self.runs[0].integrator,
+            self.known,
+        )  # fmt: skip
 
     def _normal(self, point: Point, vector: Array, noise: Noise) -> _Normal:
         """Return the normal equations at a point, by derivatives made at it or near to it."""
         known = self._known
         if known is not None and known[0].alike(point):
             at = known[0].vector()
-            if _moved_little(vector - at, noise, known[1], self.known):
-                return _Normal.of(at, noise, known[1], self.known)
+            if self._moved_little(vector - at, noise, known[1]):
+                return _Normal.of(at, self._own_rows(noise, known[1]))
         self._known = (point, self.own_slopes(point))
-        return _Normal.of(vector, noise, self._known[1], self.known)
+        return _Normal.of(vector, self._own_rows(noise, self._known[1]))
+
+    def _own_rows(self, noise: Noise, slopes: Sequence[_Own]) -> tuple[_Own, ...]:
+        white = self.whiten(noise, [own for own, _ in slopes])
+        return tuple((own, where) for own, (_, where) in zip(white, slopes, strict=True))
+
+    def _moved_little(self, away: Array, noise: Noise, slopes: Sequence[_Own]) -> bool:
+        """Whether derivatives do for a vector so far away: `_Normal.near` without a matrix."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = [np.matmul(away[where], own.transpose(1, 2, 0)).T for own, where in slopes]
+            white = self.whiten(noise, [m[:, :, None] for m in moved])
+            return bool(sum((w**2).sum() for w in white) < _NEAR)
 
     def profile(self, fit: Fit, k: int, values: Array) -> Array:
         """Return −2 log L at values (m,) of the free number k, the others following to first order.

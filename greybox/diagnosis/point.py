@@ -103,6 +103,8 @@ class Fit:
         (N, ny) measured less simulated.
     converged : bool
     integrator : {"euler", "rk4"}
+    known : tuple of ndarray
+        (N, ny) where each output of each log was measured.
     """
 
     point: Point
@@ -111,7 +113,8 @@ class Fit:
     nu: tuple[Array, ...]
     errors: tuple[Array, ...]
     converged: bool
-    integrator: Integrator = "euler"
+    integrator: Integrator
+    known: tuple[NDArray[np.bool_], ...]
 
     @property
     def escaped(self) -> bool:

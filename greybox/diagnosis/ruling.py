@@ -271,8 +271,8 @@ def _excess(fit: Fit, final: Fit) -> float:
     for group in final.noise.groups:
         sensor.append(group.sensor[0])
         places.append(group.outputs[0])
-    errors = np.concatenate(fit.errors)[:, places]
-    return float(((errors / np.maximum(sensor, 1e-300)) ** 2).mean()) - 1.0
+    errors, known = (np.concatenate(all_of)[:, places] for all_of in (fit.errors, fit.known))
+    return float(((errors / np.maximum(sensor, 1e-300)) ** 2).mean(where=known)) - 1.0
 
 
 def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> str:

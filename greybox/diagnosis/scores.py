@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.fitting import Problem, measured
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.noise import Noise
 from greybox.diagnosis.normal import bounded_step
@@ -82,7 +82,7 @@ class ProjectedScores:
         columns : sequence of ndarray
             (N, ny, m) of each log.
         """
-        rows = _stacked([self.noise.whiten(c) for c in columns])
+        rows = _stacked(self.problem.whiten(self.noise, columns))
         return self._clear(rows), (rows**2).sum(axis=0)
 
     def alone(self, columns: Sequence[Array]) -> tuple[Array, Array, Array]:
@@ -102,12 +102,13 @@ class ProjectedScores:
         size, first = columns[0].shape[2], 0
         across, before = np.zeros((size, others.shape[1])), np.zeros(size)
         with np.errstate(over="ignore", invalid="ignore"):
-            for part in columns:
+            for part, known in zip(columns, self.problem.known, strict=True):
                 samples, channels, _ = part.shape
                 beside = others[first : first + samples * channels].reshape(samples, channels, -1)
                 first += samples * channels
                 # time is last in memory
-                for i, channel in enumerate(self.noise.whiten(part).transpose(1, 2, 0)):
+                white = measured(self.noise.whiten(part), known)
+                for i, channel in enumerate(white.transpose(1, 2, 0)):
                     across += channel @ beside[:, i]
                     before += np.einsum("mt,mt->m", channel, channel)
             return across[:, -1], before - (across[:, :-1] ** 2).sum(axis=1), before

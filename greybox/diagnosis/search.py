@@ -96,7 +96,7 @@ class Candidate:
     @property
     def relevant(self) -> bool:
         """Whether the cause is large enough to matter, and to tell from sampling."""
-        numbers = sum(nu.size for nu in self.fit.nu)
+        numbers = sum(int(known.sum()) for known in self.fit.known)
         both = (self.gain + self.proof.gain) / 2
         return max(self.gain, both) > RELEVANT * numbers and not self.unresolved
 

@@ -403,6 +403,8 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
             raise ModelFileError(f"'{source}' holds a parameter that is not a finite number.")
         means = len(data["disturbances"])
         shared = np.array(data["disturbance_covariance"], float)
+        if not np.isfinite(shared).all():
+            shared = np.zeros_like(shared)
         if shared.size and shared.shape != (len(terms) + means, means):
             raise ModelFileError(
                 f"'{source}' has {len(terms)} parameters and {means} disturbances, but a "
@@ -412,7 +414,8 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
         return ManoeuvringModel(
             structure=structure,
             theta=theta,
-            covariance=np.nan_to_num(covariance),
+            # of which a part is not known there is none: zeros beside others would be exact
+            covariance=covariance if np.isfinite(covariance).all() else np.zeros_like(covariance),
             sample_time=float(data["sample_time"]),
             vessel=vessel_from_dict(data["vessel"]),
             integrator=data["integrator"],

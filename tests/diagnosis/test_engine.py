@@ -16,6 +16,7 @@ from greybox.diagnosis.noise import Likelihood, Noise, NoiseModel, fit_noise
 from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.null_model import _as_it_should_be
 from greybox.diagnosis.point import Point
+from greybox.diagnosis.scores import ProjectedScores
 from greybox.diagnosis.ship import Change, LogRun, Sensors, Ship, shifted, wired
 from greybox.diagnosis.simulator import VaryingSimulator
 from greybox.diagnosis.waves import find_waves
@@ -366,3 +367,22 @@ def test_whiteness_equals_statsmodels() -> None:
     found, expected = _whiteness("u", e), acorr_ljungbox(e, lags=[20])
     assert found.statistic == pytest.approx(float(expected["lb_stat"].iloc[0]), rel=1e-9)
     assert found.p_value == pytest.approx(float(expected["lb_pvalue"].iloc[0]), rel=1e-9)
+
+
+def test_what_was_not_measured_counts_nowhere(log: TrialLog) -> None:
+    gap = np.zeros(len(log), bool)
+    gap[100:200] = True
+    run = LogRun(WIDE, replace(log, missing={"u": gap}), "rk4")
+    problem = Problem([run])
+    point = _point(run, log)
+    errors = problem.errors(point)
+    noise = problem.noise_of(errors, point)
+    fit = problem.fit(point, noise, most=1)
+    columns = np.random.default_rng(3).normal(size=(len(log), 4, 2))
+    directions = ProjectedScores(problem, fit)
+    white = problem.whiten(noise, [columns])
+    assert not white[0][gap, 0].any()
+    assert (directions.clear([columns])[1] == (white[0] ** 2).sum(axis=(0, 1))).all()
+    _, _, before = directions.alone([columns])
+    np.testing.assert_allclose(before, (white[0] ** 2).sum(axis=(0, 1)), rtol=1e-12)
+    assert sum(known.sum() for known in fit.known) == 4 * len(log) - 100

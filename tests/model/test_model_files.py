@@ -116,6 +116,13 @@ def test_the_present_version_must_be_whole():
     assert not schema(f"model-{VERSION}").is_valid(data)
 
 
+def test_a_covariance_that_is_not_known_is_none(tmp_path):
+    unknown = 1e-4 * np.eye(plain_model().theta.size)
+    unknown[0, 0] = np.inf
+    replace(plain_model(), covariance=unknown).save(tmp_path / "m.json")
+    assert not load_model(tmp_path / "m.json").covariance.any()
+
+
 def test_a_model_read_again_is_the_same(tmp_path):
     model = replace(plain_model(), disturbances={"current_north": (0.2, 0.01)})
     model.save(tmp_path / "m.json")

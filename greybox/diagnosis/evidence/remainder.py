@@ -148,7 +148,7 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
     nu = np.concatenate([n.ravel() for n in fit.nu])
     nu -= left @ (left.T @ nu)
     pushed = _pushed(problem, fit, [pushers.alone(m, nx) for m in made])
-    whitened = [fit.noise.whiten(columns) for columns in pushed]
+    whitened = problem.whiten(fit.noise, pushed)
     square, across = _products(whitened, np.column_stack([left, nu]))
     if not np.isfinite(square).all():
         return [none for _ in uses]
@@ -173,7 +173,7 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
     with np.errstate(over="ignore", invalid="ignore"):
         shown = held.slopes(point)
         begun = held.slopes(held_fit.point)
-        starts = _stacked([noise.whiten(s) for s in begun])
+        starts = _stacked(held.whiten(noise, begun))
     out = []
     for k, delta in enumerate(deltas.T):
         # what the coefficients give back, where they can imitate
@@ -183,7 +183,7 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
                 columns[:, :, k] + slopes[:, :, :free] @ back
                 for columns, slopes in zip(moved, shown, strict=True)
             ]
-            predicted = _stacked([noise.whiten(p[:, :, None]) for p in parts])[:, 0]
+            predicted = _stacked(held.whiten(noise, [p[:, :, None] for p in parts]))[:, 0]
         if not (np.isfinite(predicted).all() and np.isfinite(starts).all()):
             out.append(none)
             continue
