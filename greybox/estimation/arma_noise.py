@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.trial.gaps import runs
+
 Array = NDArray[np.float64]
 
 # (AR, MA) orders tried; the least BIC is taken
@@ -177,7 +179,9 @@ def fit_arma_noise(
     alike = list(residuals)
     if factors:
         alike = [f.solve(e) for f, e in zip(factors, residuals, strict=True)]
-    stretches = [r for e, k in zip(alike, keep, strict=True) for r in _stretches(e, k)]
+    stretches = [
+        e[a:b] for e, k in zip(alike, keep, strict=True) for a, b in runs(k) if b - a >= 20
+    ]
     rows = sum(len(r) for r in stretches)
     scale = np.sqrt(sum(float(r @ r) for r in stretches) / max(rows, 1))
     if rows < _LEAST_ROWS or not scale > 0:
@@ -196,11 +200,6 @@ def fit_arma_noise(
             best, least = candidate, criterion
     behind = tuple(replace(n, factors=factors) for n in best.neighbours)
     return replace(best, neighbours=behind, factors=factors)
-
-
-def _stretches(e: Array, keep: NDArray[np.bool_]) -> list[Array]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], keep.astype(int), [0]])))
-    return [e[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 20]
 
 
 def _polynomial(free: Array) -> Array:

@@ -14,7 +14,8 @@ from greybox.report.thinning import find_gaps, pick, thin
 from greybox.trial.checks.finding import Finding
 from greybox.trial.checks.signal_quality import MOTION
 from greybox.trial.convert.derived_signals import continuous
-from greybox.trial.convert.resample import clock, runs
+from greybox.trial.convert.resample import clock
+from greybox.trial.gaps import runs
 from greybox.trial.raw_log import Recording, Signal
 from greybox.vessel.vessel import Vessel
 

@@ -52,6 +52,12 @@ def pieces(t: Array, longest: float) -> list[tuple[int, int]]:
     return list(pairwise([0, *breaks.tolist(), len(t)]))
 
 
+def runs(keep: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return (start, stop) of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
 def split_at_gaps(t: Array, sample_time: float) -> list[tuple[int, int]]:
     """Return the pieces of a log's times (N,) [s] between its gaps, as `pieces` does."""
     return pieces(t, GAP * sample_time)

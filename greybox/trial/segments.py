@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
-from greybox.trial.gaps import split_at_gaps
+from greybox.trial.gaps import runs, split_at_gaps
 from greybox.trial.log import Logs, TrialLog, as_list
 
 Array = NDArray[np.float64]
@@ -177,8 +177,7 @@ def find_log_gaps(log: TrialLog) -> tuple[LogGaps, ...]:
             continue
         alike.setdefault(gap.tobytes(), []).append(name)
     for names in alike.values():
-        edges = np.diff(np.concatenate([[0], log.missing[names[0]].astype(int), [0]]))
-        first, stop = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+        first, stop = np.array(runs(log.missing[names[0]])).T
         k = int(np.argmax(stop - first))
         made.append(
             LogGaps(

@@ -38,7 +38,7 @@ from greybox.trial.checks.signal_quality import (
     stuck_findings,
     time_findings,
 )
-from greybox.trial.checks.thruster_response import response_findings
+from greybox.trial.checks.thruster_response import answer_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import mend
@@ -158,7 +158,7 @@ def answer_case(name):
     if name == "thruster":
         c["alpha1"] *= -1
         recording = as_recording(c)
-        return report_of(response_findings(recording, SHIP, []), recording)
+        return report_of(answer_findings([recording], SHIP, [[]])[0], recording)
     if name == "wind sign":
         c |= {"u_q": -c["u_q"], "v_q": -c["v_q"]}
     else:

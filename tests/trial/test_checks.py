@@ -12,7 +12,7 @@ from greybox.errors import LogError, UsageError
 from greybox.trial.checks.check import check_files, check_recording
 from greybox.trial.checks.course import course_findings
 from greybox.trial.checks.finding import IDS
-from greybox.trial.checks.thruster_response import response_findings
+from greybox.trial.checks.thruster_response import answer_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.raw_log import Recording, Signal
@@ -88,9 +88,9 @@ def test_without_a_yaw_rate_the_yaw_moment_is_not_taken_for_a_side_force(ship):
     d = recorded(31, 2.0, seconds=400, wide=True)
     for gone in ({"r"}, {"r", "psi"}):
         clean = as_recording({k: v for k, v in d.items() if k not in gone})
-        assert not response_findings(clean, ship, [])
+        assert answer_findings([clean], ship, [[]]) == [[]]
     planted = swap({k: v for k, v in d.items() if k != "r"}, "alpha1", "alpha2")
-    (found,) = response_findings(as_recording(planted), ship, [])
+    ((found,),) = answer_findings([as_recording(planted)], ship, [[]])
     assert found.channels == ("alpha1", "alpha2")
 
 

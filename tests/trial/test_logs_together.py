@@ -18,7 +18,7 @@ from greybox.trial.checks.check import check_files, check_recording, check_recor
 from greybox.trial.checks.finding import CheckReport, Finding
 from greybox.trial.checks.motion import make_motion
 from greybox.trial.checks.sensor_offsets.find import Tied, find_offsets
-from greybox.trial.checks.thruster_response import answer_findings, response_findings
+from greybox.trial.checks.thruster_response import answer_findings
 from greybox.trial.import_files import import_files
 from greybox.trial.repair import apply_repairs, repair
 from greybox.trial.steps import mend
@@ -108,8 +108,8 @@ def test_a_reversed_rudder_is_reversed_in_all_logs_of_the_ship(tmp_path):
         columns[rudder] *= -1
         made = as_recording({n: columns[n].to_numpy() for n in columns}, ship)
         logs.append(replace(made, name=kind))
-    alone = [response_findings(log, ship, []) for log in logs]
-    assert [len(found) for found in alone] == [1, 0, 0]
+    alone = [answer_findings([log], ship, [[]]) for log in logs]
+    assert [len(found) for (found,) in alone] == [1, 0, 0]
     together = answer_findings(logs, ship, [[]] * 3)
     assert {f.channels for (f,) in together} == {(rudder,)}
     assert {f.logs for (f,) in together} == {("zigzag-10", "turn-port", "zigzag-20")}

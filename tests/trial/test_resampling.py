@@ -13,9 +13,8 @@ from greybox.trial.convert.resample import (
     hold_mean,
     interpolate,
     nice_period,
-    runs,
 )
-from greybox.trial.gaps import usual_step
+from greybox.trial.gaps import runs, usual_step
 
 
 def test_stretches_end_at_holes():

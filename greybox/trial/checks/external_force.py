@@ -35,7 +35,8 @@ from greybox.rotation import ned_to_body
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion, denoise, make_motion
 from greybox.trial.convert.resample import clock as make_clock
-from greybox.trial.convert.resample import hold_mean, runs
+from greybox.trial.convert.resample import hold_mean
+from greybox.trial.gaps import runs
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import Step
 from greybox.vessel.force import generalised_force

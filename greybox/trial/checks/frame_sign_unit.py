@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from greybox.rotation import ned_to_body
 from greybox.trial.checks.course import PLAUSIBLE, Course, course_scatter
 from greybox.trial.checks.finding import Finding, Outcome, declare_unit
-from greybox.trial.checks.motion import Motion, integrate, profiles, to_ned
+from greybox.trial.checks.motion import Motion, integrate, profiles, read_together, to_ned
 from greybox.trial.checks.wind_convention import STEADIER
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.steps import Step, mend
@@ -239,24 +239,13 @@ def find_readings(
         others by as much is read by itself.
     """
     logs = [_Alternatives(m) for m in motions]
-    together = list(range(len(logs)))
-    apart: list[int] = []
-    shared: Key = ()
-    while together:
-        shared = _decide([logs[i] for i in together])
-        against = [i for i in together if len(together) > 1 and _contradicts(logs[i], shared)]
-        if not against or len(against) == len(together):
-            break
-        apart += against
-        together = [i for i in together if i not in against]
-    groups = [(shared, tuple(together))] if together else []
-    groups += [(_decide([logs[i]]), (i,)) for i in apart]
+    groups = read_together(dict(enumerate(logs)), _decide, _contradicts)
     readings: dict[int, ColumnReading] = {}
     for key, group in groups:
         known = [c for i in group if i < len(courses) and (c := courses[i]) is not None]
         settled = _settle([logs[i] for i in group], known, key)
         for i in group:
-            readings[i] = _reading(i, motions[i], logs, settled, group, bool(apart))
+            readings[i] = _reading(i, motions[i], logs, settled, group, len(groups) > 1)
     return [readings[i] for i in range(len(logs))]
 
 

@@ -10,9 +10,10 @@ disagreement as the noises demand; K is estimated by maximum likelihood.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,8 @@ from greybox.trial.convert.resample import clock, stretches
 from greybox.trial.raw_log import Recording, Signal
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
+Key = TypeVar("Key")
 
 NAMES = ("x_n", "y_n", "psi", "u", "v", "r")
 _MAX_SAMPLES = 40_000
@@ -72,36 +75,33 @@ class Motion:
         if len(self) <= samples:
             return self
         size = samples // pieces
-        rows, stretches, at = [], [], 0
+        parts = []
         for k in range(pieces):
             start = round(k * (len(self) - size) / (pieces - 1))
             a, b = next((s for s in self.stretches if s[0] <= start < s[1]), self.stretches[-1])
-            part = np.arange(max(start, a), min(start + size, b))
-            if len(part) >= _MIN_STRETCH:
-                rows.append(part)
-                stretches.append((at, at + len(part)))
-                at += len(part)
-        index = np.concatenate(rows)
-        values = {n: v[index] for n, v in self.values.items()}
-        return Motion(self.t[index], self.step, values, tuple(stretches))
+            a, b = max(start, a), min(start + size, b)
+            if b - a >= _MIN_STRETCH:
+                parts.append((a, b))
+        return self.only(parts)[0]
+
+    def only(self, parts: Sequence[tuple[int, int]]) -> tuple[Motion, NDArray[np.int64]]:
+        """Return the motion in parts (start, stop) alone, and their rows."""
+        rows, stretches = end_to_end(parts)
+        values = {n: v[rows] for n, v in self.values.items()}
+        return Motion(self.t[rows], self.step, values, stretches), rows
 
     def coarser(self, step: float) -> Motion:
         """Return means over blocks of at most `step` [s]."""
         size = int(step / self.step + 1e-6)
         if size < 2:
             return self
-        rows, stretches, at = [], [], 0
-        for a, b in self.stretches:
-            count = (b - a) // size
-            if count >= _MIN_STRETCH:
-                rows.append(np.arange(a, a + count * size))
-                stretches.append((at, at + count))
-                at += count
-        if not rows:
+        blocks = [(a, (b - a) // size) for a, b in self.stretches if b - a >= _MIN_STRETCH * size]
+        if not blocks:
             return self
-        index = np.concatenate(rows).reshape(-1, size)
+        index = end_to_end([(a, a + n * size) for a, n in blocks])[0].reshape(-1, size)
         values = {n: v[index].mean(axis=1) for n, v in self.values.items()}
-        return Motion(self.t[index].mean(axis=1), size * self.step, values, tuple(stretches))
+        stretches = end_to_end([(0, n) for _, n in blocks])[1]
+        return Motion(self.t[index].mean(axis=1), size * self.step, values, stretches)
 
     @property
     def positioned(self) -> bool:
@@ -137,19 +137,22 @@ def make_motion(recording: Recording, names: tuple[str, ...] = NAMES) -> Motion 
     count = min(int((stop - start) / step + 1e-6) + 1, _MAX_SAMPLES)
     grid = start + step * np.arange(count, dtype=np.float64)
     whole = stretches(grid, clocks.values(), recording.cuts)
-    longest = sorted((r for r in whole if r[1] - r[0] >= _MIN_STRETCH), key=_length)
+    longest = sorted((r for r in whole if r[1] - r[0] >= _MIN_STRETCH), key=lambda r: r[1] - r[0])
     kept = sorted(longest[-_MAX_STRETCHES:])
     if not kept:
         return None
-    rows = np.concatenate([np.arange(a, b) for a, b in kept])
+    rows, one_after_another = end_to_end(kept)
     values = {n: np.interp(grid[rows], s.t, s.value) for n, s in signals.items()}
-    edges = np.concatenate([[0], np.cumsum([b - a for a, b in kept])])
-    kept_as = tuple((int(a), int(b)) for a, b in pairwise(edges))
-    return Motion(grid[rows], step, values, kept_as)
+    return Motion(grid[rows], step, values, one_after_another)
 
 
-def _length(run: tuple[int, int]) -> int:
-    return run[1] - run[0]
+def end_to_end(
+    parts: Sequence[tuple[int, int]],
+) -> tuple[NDArray[np.int64], tuple[tuple[int, int], ...]]:
+    """Return the rows of parts (start, stop), and where each stands among these rows."""
+    rows = [np.arange(a, b) for a, b in parts]
+    edges = np.cumsum([0, *map(len, rows)]).tolist()
+    return np.concatenate([np.empty(0, np.int64), *rows]), tuple(pairwise(edges))
 
 
 def orderly(s: Signal, *, angular: bool) -> Signal:
@@ -158,6 +161,27 @@ def orderly(s: Signal, *, angular: bool) -> Signal:
     t, once = np.unique(s.t[keep], return_index=True)
     value = s.value[keep][once]
     return Signal(s.name, t, continuous(value) if angular else value, s.unit)
+
+
+def read_together(
+    logs: Mapping[int, T],
+    decide: Callable[[Sequence[T]], Key],
+    contradicts: Callable[[T, Key], bool],
+) -> list[tuple[Key, tuple[int, ...]]]:
+    """Return what logs prefer together and which do, then each that contradicts it by itself.
+
+    Where all contradict what they prefer together, it stands.
+    """
+    together, alone = list(logs), list[int]()
+    while together:
+        shared = decide([logs[i] for i in together])
+        against = [i for i in together if len(together) > 1 and contradicts(logs[i], shared)]
+        if not against or len(against) == len(together):
+            break
+        alone += against
+        together = [i for i in together if i not in against]
+    groups = [(shared, tuple(together))] if logs else []
+    return groups + [(decide([logs[i]]), (i,)) for i in alone]
 
 
 def integrate(rate: Array, motion: Motion) -> Array:

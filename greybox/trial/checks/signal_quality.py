@@ -14,8 +14,8 @@ from greybox.trial.checks.finding import Finding, declare_unit
 from greybox.trial.convert.channel_mapping import beyond_reach
 from greybox.trial.convert.deduplicate import CUT_RUNS, second_run
 from greybox.trial.convert.derived_signals import continuous
-from greybox.trial.convert.resample import clock, runs
-from greybox.trial.gaps import GAP, HOLE, usual_step
+from greybox.trial.convert.resample import clock
+from greybox.trial.gaps import GAP, HOLE, runs, usual_step
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel

@@ -24,12 +24,14 @@ from greybox.trial.checks.motion import (
     integrated_damping,
     make_motion,
     profile,
+    read_together,
     solve,
     whiten,
     without_starts,
 )
 from greybox.trial.convert.resample import clock as make_clock
-from greybox.trial.convert.resample import hold, runs
+from greybox.trial.convert.resample import hold
+from greybox.trial.gaps import runs
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import Step, mend
 from greybox.vessel.force import generalised_force
@@ -80,13 +82,6 @@ class _Answer:
         return max(1.0, 0.2 / self.motion.step)
 
 
-def response_findings(
-    recording: Recording, vessel: Vessel, findings: Sequence[Finding]
-) -> list[Finding]:
-    """Find thruster columns of one log that are swapped or reversed, as `answer_findings` does."""
-    return answer_findings([recording], vessel, [findings])[0]
-
-
 def answer_findings(
     recordings: Sequence[Recording], vessel: Vessel, findings: Sequence[Sequence[Finding]]
 ) -> list[list[Finding]]:
@@ -120,23 +115,14 @@ def answer_findings(
         for recording, told in zip(recordings, findings, strict=True)
     ]
     known = {i: a for i, a in enumerate(answers) if a is not None}
-    together, apart = list(known), []
-    while together:
-        shared = _decide([known[i] for i in together])
-        against = [i for i in together if len(together) > 1 and _contradicts(known[i], shared)]
-        if not against or len(against) == len(together):
-            break
-        apart += against
-        together = [i for i in together if i not in against]
     found: list[list[Finding]] = [[] for _ in recordings]
-    # a log that cannot tell is read as the others are
-    follows = [i for i in range(len(recordings)) if i not in apart]
-    for deciding, members in ((together, follows), *(([i], [i]) for i in apart)):
-        told = [known[i] for i in deciding]
-        k = _decide(told)
+    for n, (k, group) in enumerate(read_together(known, _decide, _contradicts)):
         if k is None:
             continue
-        alternative = alternatives[k]
+        told, alternative = [known[i] for i in group], alternatives[k]
+        # a log that cannot tell is read as the others are
+        untold = [i for i in range(len(recordings)) if i not in known and n == 0]
+        members = sorted([*group, *untold])
         moved = [i for i in members if _moves(recordings[i], alternative.channels)]
         names = tuple(recordings[i].name for i in moved) if len(moved) > 1 else ()
         for i in moved:
@@ -170,8 +156,6 @@ def _answer(
 
 def _decide(answers: Sequence[_Answer]) -> int | None:
     """Return the alternative that these logs prefer together; None where it is as named."""
-    if not answers:
-        return None
     gains = [_gain(answers, k) for k in range(len(answers[0].read_so))]
     best = max(range(len(gains)), key=gains.__getitem__, default=None)
     return best if best is not None and gains[best] > 0 else None
@@ -309,17 +293,15 @@ def _open_loop(
     at, words = recording.text[vessel.closed_loop[0]]
     k = np.clip(np.searchsorted(at, motion.t, side="right") - 1, 0, len(words) - 1)
     free = ~np.isin(words[k], vessel.closed_loop[1])
-    rows, stretches, count = [], [], 0
-    for a, b in motion.stretches:
-        for start, stop in runs(free[a:b]):
-            if stop - start >= _MIN_SAMPLES:
-                rows.append(np.arange(a + start, a + stop))
-                stretches.append((count, count + stop - start))
-                count += stop - start
-    index = np.concatenate(rows) if rows else np.empty(0, dtype=np.int64)
-    values = {n: v[index] for n, v in motion.values.items()}
-    kept = Motion(motion.t[index], motion.step, values, tuple(stretches))
-    return kept, {n: v[index] for n, v in inputs.items()}
+    kept, rows = motion.only(
+        [
+            (a + start, a + stop)
+            for a, b in motion.stretches
+            for start, stop in runs(free[a:b])
+            if stop - start >= _MIN_SAMPLES
+        ]
+    )
+    return kept, {n: v[rows] for n, v in inputs.items()}
 
 
 class _Problem:

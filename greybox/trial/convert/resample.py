@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.gaps import HOLE, pieces, usual_step
+from greybox.trial.gaps import HOLE, pieces, runs, usual_step
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -238,12 +238,6 @@ def held_rows(of: Clock, grid: Array, sample_time: float, *, averaged: bool) -> 
         low, high = grid - sample_time + slack, grid + slack
     before, now = (np.searchsorted(of.t, x, side="right") for x in (low, high))
     return np.asarray(before == now)
-
-
-def runs(keep: Mask) -> list[tuple[int, int]]:
-    """Return (start, stop) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]])))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def nice_period(period: float) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import LogError
+from greybox.trial.gaps import runs
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres.local import noise_std
 from greybox.trial.manoeuvres.steering import (
@@ -364,10 +365,8 @@ def _turns_by_yaw_rate(log: TrialLog, signals: _Signals) -> Iterator[TurningCirc
     psi = np.convolve(np.pad(signals.psi, 2, mode="edge"), np.ones(5) / 5, "valid")
     rate = (psi[right] - psi[left]) / wide
     for sign in (1, -1):
-        turning = sign * rate > 0
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], turning.astype(int), [0]])))
-        for first, after in zip(edges[::2], edges[1::2], strict=True):
-            made = _one_turn(log, signals, sign * rate, int(first), int(after) - 1)
+        for first, after in runs(sign * rate > 0):
+            made = _one_turn(log, signals, sign * rate, first, after - 1)
             if made is not None:
                 yield made
 
