@@ -235,13 +235,10 @@ class Power:
     def visible(self, cell: Cell) -> list[Outcome]:
         """Return the trials whose effects lower the errors by as much as has to be found.
 
-        Those that were named rightly too, because what kinematics have mended before
-        shows in no free run; and all where no oracle was asked.
+        All where no oracle was asked. What was answered plays no part: counting what was named
+        rightly in any case would raise the share of right answers.
         """
-        return [
-            o for o in self.of(cell)
-            if o.oracle is None or o.oracle.matters or o.answer == "right"
-        ]  # fmt: skip
+        return [o for o in self.of(cell) if o.oracle is None or o.oracle.matters]
 
     def confusion(self, kind: str, size: float) -> dict[str, Counter[str]]:
         """Return for each truth how often each thing was found; ``none`` has one size."""
