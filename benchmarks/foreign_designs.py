@@ -39,6 +39,7 @@ SHIPS = (
     "survey-catamaran-2m",
 )  # fmt: skip
 ARMS = ("random", "zigzag", "plan", "long-random", "long-zigzag")
+OTHERS = tuple(arm for arm in ARMS if arm != "plan")
 # lengths sailed in a trial, its least and its greatest duration [s], seconds between samples
 TRIAL, SHORTEST, LONGEST = 60, 300.0, 900.0
 EVERY = {
@@ -139,28 +140,25 @@ def case(place: Path, name: str, seed: int) -> dict[str, list[float]]:
 
 
 def paired(logs: Array) -> str:
-    """Return the ratio of errors that logarithms (n,) tell, and its 95 % interval (Student's t)."""
+    """Return the ratio of errors that logarithms (n,) tell, its 95 % interval (Student's t), and n.
+
+    A pair of which one trial or estimate failed is left out.
+    """
     logs = logs[np.isfinite(logs)]
     n = len(logs)
     half = stdtrit(n - 1, 0.975) * logs.std(ddof=1) / np.sqrt(n) if n > 1 else np.nan
     low, middle, high = np.exp([logs.mean() - half, logs.mean(), logs.mean() + half])
-    return f"{middle:.2f} ({low:.2f} to {high:.2f})"
+    return f"{middle:.2f} ({low:.2f} to {high:.2f}) n={n}"
 
 
 def row(name: str, cases: Sequence[dict[str, list[float]]]) -> str:
-    """Return mean fits, and errors of the better of the two others over that of the plan.
-
-    Which is better is told by the mean of the cases, not in each case.
-    """
+    """Return mean fits, and the errors of each other kind of trial over those of the plan."""
     fits = {arm: np.array([c[arm] for c in cases]) for arm in ("first", *ARMS)}
     means = "".join(f"{np.nanmean(f):>12.1f}" for f in fits.values())
     # geometric mean over the states of the rms error in the deviation of each
     errors = {arm: np.log(np.maximum(1 - f / 100, 1e-6)).mean(axis=1) for arm, f in fits.items()}
-    told = [
-        paired(min((errors[a] for a in arms), key=np.nanmean) - errors["plan"])
-        for arms in (("random", "zigzag"), ("long-random", "long-zigzag"))
-    ]
-    return f"{name:<24}{means}   {told[0]:<22} {told[1]:<22} {len(cases)}"
+    told = "".join(f"   {paired(errors[arm] - errors['plan']):<24}" for arm in OTHERS)
+    return f"{name:<24}{means}{told}".rstrip()
 
 
 def main() -> None:
@@ -176,7 +174,7 @@ def main() -> None:
             told = {arm: round(float(np.mean(v)), 1) for arm, v in found[name][-1].items()}
             print(f"{name} {seed}: {told}", flush=True)
     print(f"{'mean held-out fit [%]':<24}" + "".join(f"{arm:>12}" for arm in ("first", *ARMS))
-          + "   error over the plan's   of half as long again  cases")  # fmt: skip
+          + "".join(f"   {f'{arm} over plan':<24}" for arm in OTHERS) + "   (errors)")  # fmt: skip
     for name, cases in found.items():
         print(row(name, cases))
     print(row("all", [c for cases in found.values() for c in cases]))

@@ -94,9 +94,12 @@ def terms(ship: str, kind: str, names: Sequence[str]) -> list[tuple[int, str, st
 
 @numba.njit(cache=True, fastmath=True)
 def simulate(x0, y, w, driver, code, eq, theta, bound, reset, want):  # type: ignore[no-untyped-def]
-    """Run freely, anew from `y` every `reset` samples; x (N, 3), sensitivities (N, 3, P)."""
+    """Run freely, anew from `y` every `reset` samples; x (N, 3), sensitivities (N, 3, P).
+
+    After the sample at which a run escapes, the third result, there are no numbers.
+    """
     count, p = len(w), len(theta)
-    out = np.zeros((count, 3))
+    out = np.full((count, 3), np.nan)
     sens = np.zeros((count if want else 1, 3, p))
     x, s, new = x0.copy(), np.zeros((3, p)), np.zeros((3, p))
     value, slope = np.ones((3, 6)), np.zeros((3, 6))

@@ -207,7 +207,9 @@ def scores(held: Sequence[HeldOut], errors: Array | None, case: Case) -> Iterato
 def report(rows: Sequence[dict[str, Any]]) -> None:
     """Print agreement by class, coverage and scores."""
     known = [r for r in rows if "refused" not in r]
-    print(f"{len(known)} cases, {len(rows) - len(known)} without a model")
+    new, kept = len(NEW) * len(known), sum(len(r["runs"]) for r in known)
+    print(f"{len(known)} cases, {len(rows) - len(known)} without a model; of {new} new trials "
+          f"{new - kept} are left out below: their run escapes or has no band")  # fmt: skip
     table = Counter((r["truth"]["level"], r["verdict"]["level"]) for r in known)
     for level in ("good", "limited", "poor"):
         row = {w: table[level, w] for w in ("good", "limited", "poor")}

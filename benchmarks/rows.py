@@ -108,7 +108,7 @@ def compare(
     ----------
     others : mapping
         The alternative's name to its work, which raises ImportError where it is not installed,
-        and to the command that installs it.
+        and to the command that installs it. What it raises else is told as its failure.
     note : callable
         Of the alternative's name, asked after all calls.
     """
@@ -119,6 +119,8 @@ def compare(
             calls[n] = calls_of(work)
         except ImportError as reason:
             missing[n] = f"not installed: {command} ({reason})" if command else str(reason)
+        except Exception as reason:
+            missing[n] = f"failed: {type(reason).__name__}: {reason}"
         else:
             works[n] = work
     taken: dict[str, list[float]] = {n: [] for n in works}
@@ -352,11 +354,7 @@ def design(intervals: int) -> Iterator[Row]:
 
     def work(name: str, *makes: Callable[[], Any]) -> tuple[Work, str]:
         def made() -> None:
-            runs = [make() for make in makes]
-            for run in runs:
-                if np.isnan(run.logdet):
-                    raise ImportError(run.note.removeprefix("skipped: "))
-            found[name] = max(runs, key=lambda r: r.logdet)
+            found[name] = max((make() for make in makes), key=lambda r: r.logdet)
 
         return made, how
 

@@ -1,12 +1,15 @@
-"""The speed of this package beside other ways to the same numbers, as on record in the manual."""
+"""The benchmarks: speed as on record in the manual, and what counts in a comparison."""
 
 from __future__ import annotations
 
 import json
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from greybox.numerics.compiler import find_compiler
@@ -43,3 +46,50 @@ def test_speed_is_at_least_half_of_that_on_record(tmp_path, row):
     assert {name for name, _, _ in both} == {row}
     slower = {k: (now[k], record[k]) for k in both if now[k] < record[k] / 2}
     assert not slower
+
+
+def test_a_run_of_scipy_that_escapes_counts_as_one_of_ours_does(monkeypatch, tmp_path):
+    for folder in (ROOT, ROOT / "benchmarks"):
+        monkeypatch.syspath_prepend(folder)
+    # interpreted, where Numba is not installed
+    monkeypatch.setitem(sys.modules, "numba", SimpleNamespace(njit=lambda **_: lambda work: work))
+    held_out, logs, peer = map(import_module, ("benchmarks.held_out", "held_out_logs",
+                                               "held_out_scipy"))  # fmt: skip
+    monkeypatch.delitem(sys.modules, "held_out_scipy")
+    y = 0.1 * np.random.default_rng(0).standard_normal((200, 3))
+    run = logs.Run("log", np.arange(200.0), y, np.ones((200, 1)))
+    np.savetxt(tmp_path / "raw.csv", np.c_[run.t, y], delimiter=",", header="t,u,v,r", comments="")
+    family = peer.Family([(0, "", "x,,"), (1, "", ",x,"), (2, "", ",,x")], [""], [run])
+    # surge grows by a half a sample
+    x, _, left = family.run(np.array([0.5, 0, 0]) / family.scale, run, np.arange(3))
+    assert 0 < left < 50
+    logs.write({"out": tmp_path}, run, x)
+    escaped, none = (held_out.score(tmp_path / "raw.csv", tmp_path / f"{n}.csv")
+                     for n in ("log", "none"))  # fmt: skip
+    assert escaped == none
+
+
+def test_pairs_with_a_failed_trial_are_told_by_their_number(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT)
+    designs = import_module("benchmarks.foreign_designs")
+    case = {arm: [80.0, 80.0, 80.0] for arm in ("first", *designs.ARMS)}
+    cases = [case, case | {"random": [60.0] * 3}, case | {"zigzag": [np.nan] * 3}]
+    told = designs.row("ship", cases)
+    assert "1.26 (0.47 to 3.40) n=3" in told
+    assert "1.00 (1.00 to 1.00) n=2" in told
+
+
+def test_an_alternative_that_fails_is_not_called_one_that_is_missing(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT)
+    rows = import_module("benchmarks.rows")
+
+    def fails():
+        raise ArithmeticError("no solution")
+
+    def missing():
+        raise ImportError("no module")
+
+    others = {"one": (fails, "pip install one"), "two": (missing, "pip install two")}
+    notes = [r.note for r in rows.compare("work", 1, "runs", lambda: None, others)]
+    assert notes == ["failed: ArithmeticError: no solution",
+                     "not installed: pip install two (no module)"]  # fmt: skip
