@@ -11,8 +11,8 @@ changes the squared held-out error of the model without causes by 1 % or more in
 what it moves the ship by is as large: a model fitted anew errs otherwise by chance. What a
 ship holds beyond (3.51) by itself is measured first, in the same way: each switch of its simulator
 is turned off, and those that count stand for the causes in `HOLDS`. A cause that stands and is
-neither planted nor held is wrong. The budget's share of the planted cause stands beside the share
-that switching it off took.
+neither planted nor held is wrong, and so is a group of causes none of which is. The budget's share
+of the planted cause stands beside the share that switching it off took.
 """
 
 from __future__ import annotations
@@ -247,11 +247,16 @@ def case(name: str, effect: str, seed: int, switches: Sequence[str]) -> dict[str
         "partial": [c["id"] for c in found["partial"]],
         "stands": bool(true & {*ids, *(c for g in groups for c in g)}),
         "headline": bool(true & {*ids}) if ids else bool(true & {c for g in groups for c in g}),
-        "wrong": sorted({*ids} - true - held), "numbers": numbers,
+        "wrong": wrong(ids, groups, true | held), "numbers": numbers,
         "gain": {k: (g["before"], g["after"]) for k, g in found["gain"].items()},
         "estimate": _fits(logs),
         "seconds": time.perf_counter() - begun,
     }  # fmt: skip
+
+
+def wrong(ids: Sequence[str], groups: Sequence[Sequence[str]], real: set[str]) -> list[str]:
+    """Return what is said and is not so: causes, and members of groups that hold no real one."""
+    return sorted({*ids, *(c for g in groups if real.isdisjoint(g) for c in g)} - real)
 
 
 def _moves(name: str, effect: str, seed: int) -> np.ndarray[Any, np.dtype[np.float64]]:

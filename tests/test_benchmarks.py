@@ -93,3 +93,12 @@ def test_an_alternative_that_fails_is_not_called_one_that_is_missing(monkeypatch
     notes = [r.note for r in rows.compare("work", 1, "runs", lambda: None, others)]
     assert notes == ["failed: ArithmeticError: no solution",
                      "not installed: pip install two (no module)"]  # fmt: skip
+
+
+def test_a_group_that_holds_no_real_cause_is_wrong(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT)
+    wrong = import_module("benchmarks.foreign_causes").wrong
+    real = {"current", "asymmetry"}
+    assert wrong(["current"], [], real) == []
+    assert wrong(["wind"], [("current", "sign")], real) == ["wind"]
+    assert wrong([], [("wind", "sign"), ("current", "waves")], real) == ["sign", "wind"]
