@@ -79,7 +79,8 @@ def fit_given(
     record = {"method": "given causes", "causes": list(ids)}
     before, after = (report.model(f, record) for f in (base, final))
     gain, _, after = report.gain(before, after, ready.validate, final)
-    fall = 1.0 - _squares(final) / max(_squares(base), 1e-300)
+    one, two = (float(f.in_sensors()[0].sum()) for f in (base, final))
+    fall = 1.0 - two / max(one, 1e-300)
     return Given(tuple(ids), before, after, fall, gain, report.where(ready.validate))
 
 
@@ -106,13 +107,3 @@ def _likeliest(
 
     hypothesis, best = min(fits, key=merit)
     return hypothesis, final_refit(case, best, hypothesis)
-
-
-def _squares(fit: Fit) -> float:
-    """Return the states' squared errors in their sensors' variances."""
-    total = 0.0
-    errors = np.concatenate(fit.errors)
-    for group in fit.noise.groups:
-        # the first of a group is its state; a heading beside the yaw rate drifts by itself
-        total += float(((errors[:, group.outputs[0]] / group.sensor[0]) ** 2).sum())
-    return total

@@ -26,7 +26,7 @@ from greybox.diagnosis.builder import held_runs
 from greybox.diagnosis.evidence.features import through_water
 from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.extension import noise_levels, one_step_deviations
-from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.fitting import Problem, stacked
 from greybox.diagnosis.gain import gains, runs_on
 from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit, Point
@@ -354,8 +354,9 @@ def fit_black_box(problem: Problem, fit: Fit, terms: Sequence[Term]) -> BlackBox
 
 def _missed(problem: Problem, fit: Fit) -> float:
     """Return the mean logarithm of the states' squared errors."""
-    errors = np.concatenate(fit.errors)[:, : len(problem.structure.states)]
-    return float(np.log(np.maximum((errors**2).mean(axis=0), 1e-300)).mean())
+    states = slice(len(problem.structure.states))
+    mean = problem.squares(fit.errors)[states] / problem.counts[states]
+    return float(np.log(np.maximum(mean, 1e-300)).mean())
 
 
 def _free(point: Point, places: tuple[int, ...]) -> Point:
@@ -395,11 +396,11 @@ class _Linear:
 
 def _linearised(problem: Problem, fit: Fit) -> _Linear | None:
     """Return the free runs to first order; None at the edge of stability."""
-    rows = np.concatenate([r.reshape(-1, r.shape[2]) for r in problem.rows(fit.point, fit.noise)])
+    rows = stacked(problem.rows(fit.point, fit.noise))
     if not np.isfinite(rows).all():
         return None
     own, begun = np.split(rows, [len(fit.point.places)], axis=1)
-    seen = np.concatenate([n.ravel() for n in fit.nu])
+    seen = stacked(fit.nu)
     alike = float(np.sqrt(correlation_factor(np.concatenate(fit.nu))))
     basis = np.linalg.qr(begun)[0]
     return _Linear(

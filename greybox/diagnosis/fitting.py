@@ -90,6 +90,11 @@ class _Normal:
             return bool(away @ self.matrix @ away < _NEAR)
 
 
+def stacked(parts: Sequence[Array]) -> Array:
+    """Return columns (N, ny, m) of logs, or innovations (N, ny), as one (sum of N·ny, ...)."""
+    return np.concatenate([p.reshape(-1, *p.shape[2:]) for p in parts])
+
+
 def measured(e: Array, known: Mask) -> Array:
     """Return innovations (N, ny, m), zero where nothing was measured."""
     return e if known.all() else np.where(known[:, :, None], e, 0.0)
@@ -368,7 +373,7 @@ class Problem:
         Constants apart; infinite where a run escapes.
         """
         parts = self.rows(fit.point, fit.noise)
-        rows = np.concatenate([r.reshape(-1, r.shape[2]) for r in parts])
+        rows = stacked(parts)
         basis = np.linalg.qr(np.delete(rows, k, axis=1))[0]
         vector = fit.point.vector()
         out = np.full(len(values), np.inf)
@@ -376,9 +381,9 @@ class Problem:
             vector[k] = value
             nu, cost = self.whitened(fit.noise, self.errors(fit.point.at(vector)))
             if np.isfinite(cost):
-                stacked = np.concatenate([n.ravel() for n in nu])
-                own = basis.T @ stacked
-                out[i] = float(stacked @ stacked - own @ own)
+                seen = stacked(nu)
+                own = basis.T @ seen
+                out[i] = float(seen @ seen - own @ own)
         return out
 
     def scan(self, fit: Fit, hypothesis: Hypothesis) -> Fit:

@@ -222,12 +222,8 @@ class DiagnosisProblem:
         return not self._escapes(fit) and self._near(fit)
 
     def _near(self, fit: Fit) -> bool:
-        sensor = np.concatenate([g.sensor for g in fit.noise.groups])
-        places = np.concatenate([g.outputs for g in fit.noise.groups]).astype(int)
-        errors = np.concatenate(fit.errors)[:, places]
-        nx = len(self.structure.states)
-        ratio = np.sqrt((errors**2).mean(axis=0)) / np.maximum(sensor, 1e-300)
-        return bool((ratio[places < nx] < _NEAR).all())
+        squares, counts = fit.in_sensors()
+        return bool((np.sqrt(squares / np.maximum(counts, 1)) < _NEAR).all())
 
     def _first(
         self, coefficients: Mapping[str, float] | None

@@ -116,6 +116,26 @@ class Fit:
     integrator: Integrator
     known: tuple[NDArray[np.bool_], ...]
 
+    def in_sensors(self, noise: Noise | None = None) -> tuple[Array, NDArray[np.int_]]:
+        """Return the states' squared errors in their sensors' variances, and how many they are.
+
+        Parameters
+        ----------
+        noise : Noise, optional
+            Whose sensors; by default those of the fit.
+
+        Returns
+        -------
+        tuple of ndarray
+            (groups,) each: of a group of channels the first is a state; a heading beside the yaw
+            rate drifts by itself.
+        """
+        groups = (self.noise if noise is None else noise).groups
+        places = [group.outputs[0] for group in groups]
+        sizes = np.maximum([group.sensor[0] for group in groups], 1e-300)
+        errors, known = (np.concatenate(x)[:, places] for x in (self.errors, self.known))
+        return ((errors / sizes) ** 2).sum(axis=0, where=known), known.sum(axis=0)
+
     @property
     def escaped(self) -> bool:
         """Whether the run has no bound."""

@@ -234,16 +234,11 @@ def _about_mean(run: LogRun) -> Array:
 
 def _missed(pairs: Sequence[Pair]) -> dict[str, float]:
     """Return the root mean square held-out error of each state in its sensor's deviations."""
-    out = {}
     names = pairs[0].problem.runs[0].outputs
-    for k, group in enumerate(pairs[0].held_fit.noise.groups):
-        i = group.outputs[0]
-        total = sum(float(p.held.squares(p.held_fit.errors)[i]) for p in pairs)
-        noise = sum(
-            float(p.held_fit.noise.groups[k].sensor[0] ** 2) * p.held.counts[i] for p in pairs
-        )
-        out[names[i]] = float(np.sqrt(total / max(noise, 1e-300)))
-    return out
+    squares, counts = np.sum([p.held_fit.in_sensors() for p in pairs], axis=0)
+    missed = np.sqrt(squares / np.maximum(counts, 1))
+    groups = pairs[0].held_fit.noise.groups
+    return {names[g.outputs[0]]: float(m) for g, m in zip(groups, missed, strict=True)}
 
 
 def _grouped(candidate: Candidate, groups: Sequence[Sequence[Candidate]]) -> bool:
@@ -267,12 +262,8 @@ def _drifts(pairs: Sequence[Pair]) -> bool:
 
 def _excess(fit: Fit, final: Fit) -> float:
     """Return the mean squared error of the states in the sensors' variances, less their own."""
-    sensor, places = [], []
-    for group in final.noise.groups:
-        sensor.append(group.sensor[0])
-        places.append(group.outputs[0])
-    errors, known = (np.concatenate(all_of)[:, places] for all_of in (fit.errors, fit.known))
-    return float(((errors / np.maximum(sensor, 1e-300)) ** 2).mean(where=known)) - 1.0
+    squares, counts = fit.in_sensors(final.noise)
+    return float(squares.sum() / counts.sum()) - 1.0
 
 
 def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> str:

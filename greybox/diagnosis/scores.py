@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.fitting import Problem, measured
+from greybox.diagnosis.fitting import Problem, measured, stacked
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.noise import Noise
 from greybox.diagnosis.normal import bounded_step
@@ -65,11 +65,11 @@ class ProjectedScores:
         self.problem, self.fit = problem, fit
         self.noise = fit.noise if noise is None else noise
         # a run at the edge of stability has derivatives beyond numbers' range, which tell nothing
-        nuisance = np.nan_to_num(_stacked(problem.rows(fit.point, self.noise)), posinf=0, neginf=0)
+        nuisance = np.nan_to_num(stacked(problem.rows(fit.point, self.noise)), posinf=0, neginf=0)
         scale = np.sqrt((nuisance**2).sum(axis=0))
         scale[scale == 0] = 1.0
         self.basis = tall_svd(nuisance / scale, 1e-8)[0]
-        self.nu = self._clear(_stacked(problem.whitened(self.noise, fit.errors)[0]))
+        self.nu = self._clear(stacked(problem.whitened(self.noise, fit.errors)[0]))
 
     def _clear(self, rows: Array) -> Array:
         return np.asarray(rows - self.basis @ (self.basis.T @ rows))
@@ -82,7 +82,7 @@ class ProjectedScores:
         columns : sequence of ndarray
             (N, ny, m) of each log.
         """
-        rows = _stacked(self.problem.whiten(self.noise, columns))
+        rows = stacked(self.problem.whiten(self.noise, columns))
         return self._clear(rows), (rows**2).sum(axis=0)
 
     def alone(self, columns: Sequence[Array]) -> tuple[Array, Array, Array]:
@@ -139,10 +139,6 @@ class ProjectedScores:
         coefficients[own] = found
         taken = rows @ found
         return float(2 * self.nu @ taken - taken @ taken), coefficients
-
-
-def _stacked(parts: Sequence[Array]) -> Array:
-    return np.concatenate([p.reshape(-1, p.shape[2]) if p.ndim == 3 else p.ravel() for p in parts])
 
 
 def score_hypotheses(directions: ProjectedScores, hypotheses: Sequence[Hypothesis]) -> list[Score]:

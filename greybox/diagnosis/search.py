@@ -17,7 +17,7 @@ from greybox.diagnosis.evidence.held_out import HeldOut, Proof, proof_of
 from greybox.diagnosis.evidence.omnibus import omnibus
 from greybox.diagnosis.evidence.remainder import MOTION_AND_COMMANDS, contributions_beside
 from greybox.diagnosis.evidence.standing import Standing, level_of, standing
-from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.fitting import Problem, stacked
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.null_model import DiagnosisProblem
@@ -610,7 +610,7 @@ def _at_null(problem: Problem, fit: Fit, hypothesis: Hypothesis) -> Array:
     null = np.zeros(len(where))
     for k, parameter in enumerate(hypothesis.parameters[: len(where)]):
         null[k] = vector[where[k]] if parameter.reach else parameter.null
-    rows = np.concatenate([r.reshape(-1, r.shape[2]) for r in problem.rows(fit.point, fit.noise)])
+    rows = stacked(problem.rows(fit.point, fit.noise))
     rest = np.setdiff1d(np.arange(len(vector)), where)
     change = null - vector[where]
     if np.isfinite(rows).all() and len(where):

@@ -29,7 +29,7 @@ from greybox.diagnosis.evidence.features import (
     knots_of,
 )
 from greybox.diagnosis.evidence.held_out import Pair
-from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.fitting import Problem, stacked
 from greybox.diagnosis.linear import NOWHERE
 from greybox.diagnosis.point import Fit
 from greybox.model.terms import mirror_sign
@@ -127,12 +127,12 @@ def fit_generic_forces(pair: Pair, uses: Sequence[Use]) -> None:
 
 def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
     problem, fit, held, held_fit = pair.problem, pair.fit, pair.held, pair.held_fit
-    nuisance = _stacked(problem.rows(fit.point, fit.noise))
+    nuisance = stacked(problem.rows(fit.point, fit.noise))
     free = nuisance.shape[1] - sum(map(len, fit.point.starts))
     with np.errstate(over="ignore", invalid="ignore"):
         scale = np.sqrt((nuisance**2).sum(axis=0))
     scale[scale == 0] = 1.0
-    seen = np.concatenate([n.ravel() for n in held_fit.nu])
+    seen = stacked(held_fit.nu)
     # a run at the edge of stability has no derivatives
     none = GenericForce(np.zeros_like(seen), seen, held_fit.errors, np.zeros(free))
     if not np.isfinite(scale).all():
@@ -145,7 +145,7 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
     knots = knots_of(problem)
     nx, made = len(problem.structure.states), _features(problem, fit, knots)
     pushers = _Pushers.of(made, problem.structure.states, any_of)
-    nu = np.concatenate([n.ravel() for n in fit.nu])
+    nu = stacked(fit.nu)
     nu -= left @ (left.T @ nu)
     pushed = _pushed(problem, fit, [pushers.alone(m, nx) for m in made])
     whitened = problem.whiten(fit.noise, pushed)
@@ -173,7 +173,7 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
     with np.errstate(over="ignore", invalid="ignore"):
         shown = held.slopes(point)
         begun = held.slopes(held_fit.point)
-        starts = _stacked(held.whiten(noise, begun))
+        starts = stacked(held.whiten(noise, begun))
     out = []
     for k, delta in enumerate(deltas.T):
         # what the coefficients give back, where they can imitate
@@ -183,7 +183,7 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
                 columns[:, :, k] + slopes[:, :, :free] @ back
                 for columns, slopes in zip(moved, shown, strict=True)
             ]
-            predicted = _stacked(held.whiten(noise, [p[:, :, None] for p in parts]))[:, 0]
+            predicted = stacked(held.whiten(noise, [p[:, :, None] for p in parts]))[:, 0]
         if not (np.isfinite(predicted).all() and np.isfinite(starts).all()):
             out.append(none)
             continue
@@ -338,10 +338,6 @@ def _products(parts: Sequence[Array], others: Array) -> tuple[Array, Array]:
                 square += channel @ channel.T
                 across += channel @ beside[:, i]
     return square, across
-
-
-def _stacked(parts: Sequence[Array]) -> Array:
-    return np.concatenate([p.reshape(-1, p.shape[2]) for p in parts])
 
 
 def _likeliest(square: Array, along: Array, pushers: _Pushers, use: Use) -> Array:
