@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.quantities import numbers_by_true_north
-from greybox.diagnosis.ship import CURRENTS, Sensors, Wire
+from greybox.diagnosis.ship import CURRENTS, Sensors, Ship, Wire
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.run.changes import Change
@@ -106,10 +106,20 @@ def extended_model(
         residual_std=one_step_deviations(problem, white),
         noise=noise_levels(problem, white),
         sums=summed,
-        changes=tuple(Change(names[c.index], c.factor, c.time) for c in ship.changes),
+        changes=_changes(ship, names),
         conditions=pooled_conditions(logs).values,
         record=dict(record),
     )
+
+
+def _changes(ship: Ship, names: Sequence[str]) -> tuple[Change, ...]:
+    """Return a ship's changes as a model has them, each by how much of the first value."""
+    factors: dict[int, float] = {}
+    out = []
+    for change in sorted(ship.changes, key=lambda c: c.time):
+        factors[change.index] = factors.get(change.index, 1.0) * change.factor
+        out.append(Change(names[change.index], factors[change.index], change.time))
+    return tuple(out)
 
 
 def extended_vessel(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from greybox.diagnosis.diagnose import diagnose
+from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.null_model import clocks_of
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.ship import Ship
@@ -95,8 +96,11 @@ def test_a_model_whose_coefficients_change_is_judged_with_its_changes(modelled) 
     for k in (0, 110, 200, 399):
         expected = model.theta * factors_at(changes, model.names, float(k))
         assert run.parameters(given.point.ship)[k, : len(expected)] == pytest.approx(expected)
-    begun = ready.base().point.base.changes
-    assert begun == given.point.ship.changes
+    base = ready.base()
+    assert base.point.base.changes == given.point.ship.changes
+    problem = ready.case.problem(base.integrator)
+    told = extended_model(ready.structure, problem, base, ready.case.logs, {}, {}).changes
+    assert [c.factor for c in told] == pytest.approx([1.5, 1.2, 0.8])
 
 
 def test_a_coefficient_that_comes_back_from_zero_is_refused(modelled) -> None:
