@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
-from io import BytesIO
 from typing import IO
 
 from greybox.errors import LogError
-from greybox.trial.readers.ros.decompress import inflate
 from greybox.trial.readers.ros.storage import (
     Budget,
     Channel,
     CutError,
     Message,
+    Records,
     Wanted,
+    inflate,
     normal_type,
-    read_records,
     skip,
     take,
 )
@@ -46,7 +44,7 @@ def _number(fields: dict[str, bytes], name: str, layout: str = "<I") -> int:
 def read_bag1(
     handle: IO[bytes], budget: Budget, notes: list[str], wanted: Wanted
 ) -> Iterator[Message]:
-    """Yield the messages of a ROS 1 bag, as `read_records` does.
+    """Yield the messages of a ROS 1 bag, as `Records.read` does.
 
     Raises
     ------
@@ -59,17 +57,10 @@ def read_bag1(
             f"'{budget.name}' is a bag of format {line.strip().decode('ascii', 'replace')!r}, "
             f"only 2.0 is read: convert it with 'rosbag migrate'."
         )
-    yield from read_records(_Bag({}, budget, notes, wanted), handle)
+    yield from _Bag(budget, notes, wanted).read(handle)
 
 
-@dataclass
-class _Bag:
-    channels: dict[int, Channel]
-    budget: Budget
-    notes: list[str]
-    wanted: Wanted
-    damaged: int = 0
-
+class _Bag(Records):
     def records(self, stream: IO[bytes], end: int, *, top: bool) -> Iterator[Message]:
         while stream.tell() < end:
             (size,) = struct.unpack("<I", take(stream, 4, end))
@@ -100,16 +91,10 @@ class _Bag:
         self, stream: IO[bytes], fields: dict[str, bytes], length: int, end: int
     ) -> Iterator[Message]:
         start = stream.tell()
-        whole = start + length <= end
         data = take(stream, min(length, end - start), end)
         compression = fields.get("compression", b"none").decode("ascii", "replace")
         content = inflate(data, compression, _number(fields, "size"), self.budget)
-        try:
-            yield from self.records(BytesIO(content), len(content), top=False)
-        except CutError:
-            self.damaged += whole
-        if not whole:
-            raise CutError(f"ends at byte {end} inside the chunk at byte {start}")
+        yield from self.inside(content, start, start + length, end)
 
     def _connection(self, fields: dict[str, bytes], data: bytes) -> None:
         number = _number(fields, "conn")

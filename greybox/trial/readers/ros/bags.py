@@ -21,9 +21,15 @@ from greybox.trial.readers.limits import limits
 from greybox.trial.readers.ros import database, mcap_file
 from greybox.trial.readers.ros.bag1 import read_bag1
 from greybox.trial.readers.ros.database import read_database
-from greybox.trial.readers.ros.decompress import inflate_file, inflate_zstd
 from greybox.trial.readers.ros.mcap_file import read_mcap
-from greybox.trial.readers.ros.storage import Budget, CutError, Message, Wanted
+from greybox.trial.readers.ros.storage import (
+    Budget,
+    CutError,
+    Message,
+    Wanted,
+    inflate_file,
+    inflate_zstd,
+)
 
 
 def storage_files(path: Path) -> tuple[list[Path], str, list[str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 from typing import IO
 
@@ -14,15 +14,15 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from greybox.trial.readers.ros.decompress import inflate
 from greybox.trial.readers.ros.storage import (
     Budget,
     Channel,
     CutError,
     Message,
+    Records,
     Wanted,
+    inflate,
     normal_type,
-    read_records,
     skip,
     take,
 )
@@ -31,13 +31,8 @@ MAGIC = b"\x89MCAP0\r\n"
 
 
 @dataclass
-class _Mcap:
-    schemas: dict[int, tuple[str, str, str]]
-    channels: dict[int, Channel]
-    budget: Budget
-    notes: list[str]
-    wanted: Wanted
-    damaged: int = 0
+class _Mcap(Records):
+    schemas: dict[int, tuple[str, str, str]] = field(default_factory=dict)
 
     def records(self, stream: IO[bytes], end: int, *, top: bool) -> Iterator[Message]:
         while stream.tell() < end:
@@ -97,18 +92,12 @@ class _Mcap:
             data = data[:held]
         raw = inflate(data, kind, stated, self.budget)
         sound = whole and len(raw) == stated and (not crc or zlib.crc32(raw) == crc)
-        try:
-            yield from self.records(BytesIO(raw), len(raw), top=False)
-        except CutError:
-            sound = False
-        if not whole:
-            raise CutError(f"ends at byte {end} inside the chunk at byte {start}")
-        self.damaged += not sound
+        yield from self.inside(raw, start, start + length, end, sound=sound)
 
 
 def read_mcap(
     handle: IO[bytes], budget: Budget, notes: list[str], wanted: Wanted
 ) -> Iterator[Message]:
-    """Yield the messages of an MCAP file, as `read_records` does."""
+    """Yield the messages of an MCAP file, as `Records.read` does."""
     handle.seek(len(MAGIC))
-    yield from read_records(_Mcap({}, {}, budget, notes, wanted), handle)
+    yield from _Mcap(budget, notes, wanted).read(handle)
