@@ -17,7 +17,7 @@ from greybox.errors import LogError, UsageError
 from greybox.trial.checks.check import check_files, check_recording, check_recordings
 from greybox.trial.checks.finding import CheckReport, Finding
 from greybox.trial.checks.motion import make_motion
-from greybox.trial.checks.sensor_offsets.find import Tied, find_offsets
+from greybox.trial.checks.sensor_offsets.findings import Tied, find_offsets
 from greybox.trial.checks.thruster_response import answer_findings
 from greybox.trial.import_files import import_files
 from greybox.trial.repair import apply_repairs, repair

@@ -22,7 +22,7 @@ from greybox.trial.checks.heading_wrap import wrap_findings
 from greybox.trial.checks.motion import Motion, make_motion
 from greybox.trial.checks.position_hold import hold_findings
 from greybox.trial.checks.position_jump import jump_findings
-from greybox.trial.checks.sensor_offsets.find import Tied, find_offsets
+from greybox.trial.checks.sensor_offsets.findings import Tied, find_offsets
 from greybox.trial.checks.signal_quality import (
     angle_unit_findings,
     coarse_findings,
