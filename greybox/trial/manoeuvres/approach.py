@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.trial.manoeuvres.local import fit_at, regress
 from greybox.trial.manoeuvres.quantity import Quantity
+from greybox.trial.manoeuvres.track import Track
 
 Array = NDArray[np.float64]
 
@@ -38,6 +39,18 @@ class Approach:
     def duration(self, length: float) -> float:
         """Return the time in which the ship sails its own length [s]."""
         return length / max(self.speed.value, 1e-9)
+
+
+def first_notes(name: str, approach: Approach, track: Track) -> list[str]:
+    """Return what is to be noted of the approach to a manoeuvre and of its track."""
+    notes = []
+    if not approach.seen:
+        notes.append(
+            f"no straight approach before the {name}: heading and speed are those at its start"
+        )
+    if track.integrated:
+        notes.append("positions are integrated from u, v and heading, none were measured")
+    return notes
 
 
 def measure_approach(

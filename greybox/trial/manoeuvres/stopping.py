@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from greybox.notebook import DisplayMixin
 from greybox.rotation import ned_to_body
-from greybox.trial.manoeuvres.approach import measure_approach
+from greybox.trial.manoeuvres.approach import first_notes, measure_approach
 from greybox.trial.manoeuvres.local import crossing, fit_at
 from greybox.trial.manoeuvres.quantity import Quantity
 from greybox.trial.manoeuvres.standards import (
@@ -126,27 +126,16 @@ def measure_stopping(
 
     Parameters
     ----------
-    t : ndarray
-        (N,) time, increasing, even or not [s].
-    x_n, y_n : ndarray or None
-        (N,) position of the body origin over ground [m]; integrated from the
-        velocities where absent, which the notes then say.
-    psi : ndarray
-        (N,) heading, unwrapped [rad].
-    u, v : ndarray
-        (N,) velocity over ground, body axes [m/s].
+    t, x_n, y_n, psi, u, v, length, heading_std, position_std
+        As `measure_turning_circle`.
     start : float
         When the stop was ordered [s].
-    length : float
-        Of the ship [m].
     stop : float, optional
         Until when the ship may come to rest [s]; the end of the log by default.
     reversed_thrust : bool
         Whether the thrust was reversed: the limit is for full astern.
     end_speed : float
         Surge velocity at which the ship counts as stopped [m/s].
-    heading_std, position_std : float, optional
-        Known noise of one sample [rad], [m]; taken from the log otherwise.
     start_std : float
         Standard error of `start` [s].
 
@@ -158,13 +147,7 @@ def measure_stopping(
     approach = measure_approach(t, psi, u, v, start, length, heading_std=heading_std)
     track = make_track(t, x_n, y_n, psi, u, v, position_std=position_std, heading_std=heading_std)
     stop = float(t[-1]) if stop is None else stop
-    notes = []
-    if not approach.seen:
-        notes.append(
-            "no straight approach before the stop: heading and speed are those at its start"
-        )
-    if track.integrated:
-        notes.append("positions are integrated from u, v and heading, none were measured")
+    notes = first_notes("stop", approach, track)
     psi0 = approach.heading
     time = reach = head = lateral = turned = last = None
     run = approach.duration(length)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.notebook import DisplayMixin
 from greybox.rotation import ned_to_body
-from greybox.trial.manoeuvres.approach import Approach, measure_approach
+from greybox.trial.manoeuvres.approach import Approach, first_notes, measure_approach
 from greybox.trial.manoeuvres.local import LocalFit, crossing, fit_at, noise_std, regress
 from greybox.trial.manoeuvres.quantity import Quantity
 from greybox.trial.manoeuvres.standards import (
@@ -225,14 +225,7 @@ def measure_turning_circle(
     turned = psi[inside] - approach.heading.value
     direction = 1 if turned[int(np.argmax(np.abs(turned)))] > 0 else -1
     turned = direction * turned
-    notes = []
-    if not approach.seen:
-        notes.append(
-            "no straight approach before the turn: heading and speed are those at its start"
-        )
-    if track.integrated:
-        notes.append("positions are integrated from u, v and heading, none were measured")
-
+    notes = first_notes("turn", approach, track)
     own = direction * (psi - approach.heading.value)
     scale = approach.duration(length)
     quarter = crossing(t, own, math.pi / 2, start, stop, scale, std=heading_std)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.notebook import DisplayMixin
-from greybox.trial.manoeuvres.approach import measure_approach
+from greybox.trial.manoeuvres.approach import first_notes, measure_approach
 from greybox.trial.manoeuvres.local import crossing, fit_at, peak
 from greybox.trial.manoeuvres.quantity import Quantity
 from greybox.trial.manoeuvres.standards import (
@@ -152,21 +152,12 @@ def measure_zigzag(
 
     Parameters
     ----------
-    t : ndarray
-        (N,) time, increasing, even or not [s].
-    x_n, y_n : ndarray or None
-        (N,) position of the body origin over ground [m]; integrated from the
-        velocities where absent, which the notes then say.
-    psi : ndarray
-        (N,) heading, unwrapped [rad].
-    u, v : ndarray
-        (N,) velocity over ground, body axes [m/s].
+    t, x_n, y_n, psi, u, v, length, heading_std, position_std
+        As `measure_turning_circle`.
     executes : sequence of float
         First, second, … execute [s], at least two.
     rudder : float
         Rudder angle [rad], any sign.
-    length : float
-        Of the ship [m].
     heading : float, optional
         Change of heading at which the rudder was to be reversed [rad], any sign; that of the
         executes otherwise, which a quick ship may pass before the next sample.
@@ -175,8 +166,6 @@ def measure_zigzag(
     scale : float
         Length of the full-scale ship over `length`: limits depend on L/V, which
         a model in Froude scale has smaller by its square root.
-    heading_std, position_std : float, optional
-        Known noise of one sample [rad], [m]; taken from the log otherwise.
     start_std : float
         Standard error of each execute [s].
 
@@ -196,13 +185,7 @@ def measure_zigzag(
         )
     approach = measure_approach(t, psi, u, v, start, length, heading_std=heading_std)
     track = make_track(t, x_n, y_n, psi, u, v, position_std=position_std, heading_std=heading_std)
-    notes = []
-    if not approach.seen:
-        notes.append(
-            "no straight approach before the zig-zag: heading and speed are those at its start"
-        )
-    if track.integrated:
-        notes.append("positions are integrated from u, v and heading, none were measured")
+    notes = first_notes("zig-zag", approach, track)
     ends = [*map(float, executes[1:]), stop]
     psi0 = approach.heading
     away = float(np.interp(executes[1], t, psi)) - psi0.value
