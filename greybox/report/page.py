@@ -138,7 +138,8 @@ _TEMPLATE = """{% macro drawn(picture) %}{% set chart = chart_of(picture) %}
 <thead><tr>{% for cell in table.header %}<th scope="col">{{ cell }}</th>{% endfor %}</tr></thead>
 <tbody>{% for row in table.rows %}<tr>{% for cell in row %}<td
 {%- if table.sentences and 0 < loop.index0 < row | length - 1 %} data-name="
-{{- table.header[loop.index0] }}"{% endif %}>{{ cell }}</td>{% endfor %}</tr>
+{{- table.header[loop.index0] }}"{% elif not table.sentences and cell | length > 40 %} class="long"
+{%- endif %}>{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}</tbody></table></div>
 {% endfor %}
 {% endmacro %}
@@ -186,10 +187,12 @@ table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabu
 th, td { padding: 0.2rem 0.6rem; border-bottom: 1px solid #ddd; text-align: right;
          white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
+td:first-child { white-space: normal; max-width: 18rem; overflow-wrap: break-word; }
+td.long { white-space: normal; overflow-wrap: anywhere; }
+td.long:not(:first-child) { min-width: 10rem; }
 table.sentences th, table.sentences td { text-align: left; white-space: normal;
          vertical-align: top; }
 table.sentences td:last-child { overflow-wrap: anywhere; }
-table.sentences td:first-child { max-width: 18rem; overflow-wrap: break-word; }
 caption { text-align: left; font-weight: 600; padding: 0.3rem 0; }
 caption span { display: inline-block; position: sticky; left: 0;
                max-width: calc(100vw - 2rem); }
@@ -211,12 +214,13 @@ del { background: #f9ddcc; }
   td[data-name]::before { content: attr(data-name) ": "; color: #444; }
   td[data-name]:empty { display: none; }
   table { font-size: 0.8rem; } th, td { padding: 0.2rem 0.3rem; } th { white-space: normal; }
-  td:first-child { position: sticky; left: 0; background: #fff; } }
+  td:first-child { position: sticky; left: 0; background: #fff; max-width: 8rem; } }
 @media print { button { display: none; } html { font-size: 11px; }
   figure > svg { max-width: 150mm; } body { max-width: none; font-size: 1rem; }
   figure { break-inside: avoid; }
   .pictures { grid-template-columns: 1fr 1fr; } h2, h3 { break-after: avoid; }
   .wide { overflow: visible; } th, td { white-space: normal; padding: 0.2rem 0.3rem; }
+  td:first-child { max-width: 10rem; overflow-wrap: anywhere; min-width: 4rem; }
   tr, li { break-inside: avoid; } pre { white-space: pre-wrap; } }
 </style>
 </head>

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from browser import needs_browser, require_legible
+from browser import driven, needs_browser, require_legible
 
 from greybox.report.figures import comparison_figure, overview_figure, to_svg
 from greybox.report.page import Page, Picture, Table, flatten, render, write_page
@@ -69,3 +69,27 @@ def test_in_a_browser(tmp_path, width):
     path = tmp_path / "page.html"
     write_page(page(width=12), path)
     require_legible(path, width)
+
+
+@needs_browser
+def test_a_long_name_leaves_the_numbers_beside_it_room(tmp_path):
+    """A name without a break neither covers a phone nor widens a printed page."""
+    name, numbers = "linear+" + "+".join(["X_|v|r"] * 14), ["-0.0064 to -0.0052"] * 4
+    tables = [Table("Tried", ["structure", *"abcd"], [[name, *numbers], ["Xu", *numbers]]),
+              Table("Fits", ["model", "log", *"abcd"], [["m", "log " * 30, *numbers]])]  # fmt: skip
+    path = tmp_path / "page.html"
+    write_page(Page("Title", "Headline", tables=tables), path)
+    with driven(path) as browser:
+        for media, width in (("screen", 390), ("print", 680)):
+            browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": media})
+            browser.execute_cdp_cmd(
+                "Emulation.setDeviceMetricsOverride",
+                {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False},
+            )
+            page, box, first, second = browser.execute_script(
+                "const [e, f] = document.querySelectorAll('.wide'); return ["
+                "document.documentElement.scrollWidth, e.clientWidth, "
+                "e.querySelector('td').clientWidth, f.querySelectorAll('td')[1].clientWidth]"
+            )
+            assert page <= width
+            assert max(first, second) < 0.6 * box
