@@ -39,15 +39,13 @@ LEFT = 0.2
 _SURE = 1e4
 
 
-def correlation_lags(residuals: Sequence[Array], largest: int | None = None) -> int:
-    """Return the lag after which the autocorrelation stays insignificant.
+def correlation_lags(residuals: Sequence[Array]) -> int:
+    """Return the lag after which the autocorrelation stays insignificant, N/10 at most.
 
     Parameters
     ----------
     residuals : sequence of ndarray
         (N,) an uninterrupted stretch each.
-    largest : int, optional
-        Upper limit; by default N/10.
 
     References
     ----------
@@ -55,8 +53,7 @@ def correlation_lags(residuals: Sequence[Array], largest: int | None = None) -> 
     |ρ(m+k)| < 2√(log₁₀ N / N) for k = 1 … K.
     """
     total = sum(len(r) for r in residuals)
-    if largest is None:
-        largest = max(1, min(total // 10, 200))
+    largest = max(1, min(total // 10, 200))
     mean = sum(float(r.sum()) for r in residuals) / max(total, 1)
     residuals = [r - mean for r in residuals]
     variance = sum(float(r @ r) for r in residuals)

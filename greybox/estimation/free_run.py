@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.estimation.fixed_gain_observer import ObservedRuns
+from greybox.estimation.innovations import ObservedRuns
 from greybox.estimation.shooting import (
     TOLERANCE,
     FreeRuns,

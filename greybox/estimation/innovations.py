@@ -1,8 +1,9 @@
-"""Maximum likelihood with process noise: innovations of an extended Kalman filter.
+"""Innovations of a filter: maximum likelihood with process noise, and runs at a fixed gain.
 
-Parameters and initial states move by Gauss-Newton steps on the innovations, with
-the exact gradient of the likelihood; the variances of the measurements and of the
-process noise maximise the same likelihood in between.
+Parameters and initial states move by Gauss-Newton steps on the innovations of an extended
+Kalman filter, with the exact gradient of the likelihood; the variances of the measurements and
+of the process noise maximise the same likelihood in between. Runs that an observer of one gain
+corrects towards the log are nearly linear in the parameters.
 
 References
 ----------
@@ -30,7 +31,7 @@ from greybox.estimation.shooting import (
     solve_step,
 )
 from greybox.model.output import OutputModel
-from greybox.model.run.output_runs import Filter
+from greybox.model.run.output_runs import Filter, Observer
 
 Array = NDArray[np.float64]
 
@@ -218,3 +219,47 @@ def fit_innovations(
 def _weight(noise: Array, before: Array) -> Array:
     """Return how much each variance counts: one that is nearly nothing may move."""
     return np.asarray(np.maximum(noise, before) > 1e-4 * np.maximum(noise, before).max(), float)
+
+
+class ObservedRuns:
+    """Errors of runs whose measured states are corrected at every step.
+
+    Parameters
+    ----------
+    model : OutputModel
+    segments : Segments
+        One per log, none joined.
+    variance : ndarray
+        (ny,) of the measurements.
+    ratio : float
+        Variance of what moves a state each step over that of its measurement. The gain
+        is that of the steady Kalman filter of a random walk so moved; the errors are in
+        the deviations that it expects.
+    """
+
+    def __init__(
+        self, model: OutputModel, segments: Segments, variance: Array, ratio: float
+    ) -> None:
+        self.segments = segments
+        before = (ratio + np.sqrt(ratio**2 + 4 * ratio)) / 2
+        self.gain = before / (1 + before)
+        self.sigma = np.sqrt(variance * (1 + before))
+        self._observer = Observer(model, segments.w, segments.y, segments.use)
+
+    def linearise(self, p: Array, nodes: Array) -> Linearised:
+        """Return errors and their derivatives at parameters (q,) and starts (M, nz)."""
+        error, rows = self._observer(nodes, p, self.gain)
+        none = np.zeros((*nodes.shape, rows.shape[3]))
+        with np.errstate(over="ignore", invalid="ignore"):
+            weighted = by_sample(rows / self.sigma[:, None])
+            return Linearised(error / self.sigma, weighted, np.zeros_like(nodes), none)
+
+    def by_parameters(self, p: Array, nodes: Array, only: Sequence[int]) -> Array:
+        """Return derivatives of what is expected in some parameters, (M, m, ny, len(only))."""
+        return self._observer.by_parameters(nodes, p, self.gain, only)
+
+    def value(self, p: Array, nodes: Array) -> tuple[Array, Array, float]:
+        """Return errors, without ends and level."""
+        error, _ = self._observer(nodes, p, self.gain, sensitivities=False)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return error / self.sigma, np.zeros_like(nodes), 0.0

@@ -27,10 +27,12 @@ from greybox.estimation.covariance import (
 from greybox.estimation.free_run import Shooting, changes, fit_free_runs, in_doubt
 from greybox.estimation.free_run_errors import (
     memory_correction,
+    noise_of_run,
+    noise_of_sensors,
+    residual_noise,
     shared_score_covariance,
     slow_errors,
 )
-from greybox.estimation.free_run_noise import noise_of_run, noise_of_sensors, residual_noise
 from greybox.estimation.informative import unexcited
 from greybox.estimation.innovations import FilterRuns, fit_innovations
 from greybox.estimation.output_setup import deviations, measured, output_model, turns

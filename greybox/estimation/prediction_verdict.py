@@ -193,22 +193,8 @@ class RunsDiverge(Reason):
         )
 
 
-@dataclass(frozen=True)
-class RefitsDiverge(Reason):
-    """Free runs of models that were estimated without a part of the logs leave their bound.
-
-    Parameters
-    ----------
-    logs : tuple of str
-    count : int
-        Of all runs.
-    after : float
-        Of the first to do so [s].
-    """
-
-    logs: tuple[str, ...]
-    count: int
-    after: float
+class RefitsDiverge(RunsDiverge):
+    """Free runs of models that were estimated without a part of the logs leave their bound."""
 
     kind: ClassVar[str] = "refits_diverge"
     fatal: ClassVar[bool] = False

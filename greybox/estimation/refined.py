@@ -492,28 +492,13 @@ def _spread(errors: Sequence[Array], keep: Sequence[NDArray[np.bool_]]) -> Array
     return np.asarray(np.concatenate(kept).std(axis=0))
 
 
-def with_noise(
-    estimate: Estimate,
-    logs: Sequence[TrialLog],
-    *,
-    heading: Literal["measured", "simulated"] = "measured",
-    wind: Literal["smoothed", "measured"] = "smoothed",
-    margins: dict[str, float] | None = None,
-) -> Estimate:
-    """Return a plain estimate with the noise levels that its equation errors tell.
+def add_noise(problem: RegressionProblem, estimate: Estimate) -> Estimate:
+    """Return a plain estimate of a problem with the noise levels that its equation errors tell.
 
     Sensors are taken as stated and the process noise as white: errors of plain
     coefficients are too far off to decide more. Without change where the motion
     that the estimate predicts diverges.
     """
-    problem = RegressionProblem(
-        estimate.predictor, tuple(logs), margins=margins, heading=heading, wind=wind
-    )
-    return add_noise(problem, estimate)
-
-
-def add_noise(problem: RegressionProblem, estimate: Estimate) -> Estimate:
-    """Return a plain estimate of a problem with noise levels, as `with_noise`."""
     work = _Refinement(problem)
     point = work.start(estimate.theta, problem.keep)
     if point.diverged >= 0:

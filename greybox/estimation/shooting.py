@@ -87,8 +87,8 @@ class Segments:
     joined: NDArray[np.bool_]
 
 
-def cut(logs: Sequence[Measured], steps: int, *, joined_up: bool = True) -> Segments:
-    """Cut logs into segments of `steps` samples, to be joined or each by itself."""
+def cut(logs: Sequence[Measured], steps: int) -> Segments:
+    """Cut logs into segments of `steps` samples, to be joined."""
     w, y, use, joined = [], [], [], []
     for log in logs:
         samples = len(log.y)
@@ -99,7 +99,7 @@ def cut(logs: Sequence[Measured], steps: int, *, joined_up: bool = True) -> Segm
             y.append(log.y[index])
             own = np.arange(j * steps, (j + 1) * steps) < samples
             use.append((own & log.known[index]).astype(float))
-            joined.append(joined_up and j + 1 < count)
+            joined.append(j + 1 < count)
     return Segments(np.array(w), np.array(y), np.array(use), np.array(joined))
 
 

@@ -18,6 +18,8 @@ from greybox.model.structure import Structure
 # added mass in surge as a share of the mass, where nothing better is known;
 # slender-body values lie between 0.03 and 0.07 (Clarke, Gedling and Hine, 1983)
 SURGE_ADDED_MASS = 0.05
+# relative difference up to which a tie counts as held
+_HELD = 0.1
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Inertia:
 class Tie:
     """A relation that Table 3.1 implies between discrete parameters.
 
-    ``holds`` is true when the two sides differ by less than the tolerance.
+    ``holds`` is true when the two sides differ by no more than a tenth of the larger.
     """
 
     name: str
@@ -90,7 +92,6 @@ def estimate_inertia(
     *,
     mass: float,
     thrust_in_newtons: bool,
-    surge_added_mass: float = SURGE_ADDED_MASS,
 ) -> Inertia:
     """Return the inertias that a mass and the input gains imply.
 
@@ -103,9 +104,7 @@ def estimate_inertia(
     mass : float
         m [kg]
     thrust_in_newtons : bool
-        True: µ = 1, so m − X_u̇ = Ts/Xmu. False: m − X_u̇ = m (1 + added mass).
-    surge_added_mass : float
-        −X_u̇/m that is assumed without a thrust in newtons.
+        True: µ = 1, so m − X_u̇ = Ts/Xmu. False: m − X_u̇ = m (1 + `SURGE_ADDED_MASS`).
 
     Raises
     ------
@@ -123,18 +122,12 @@ def estimate_inertia(
             f"the inertias follow from the input gains Xmu, Ymu and Nmu, and {zero[0]} is "
             f"{gains[zero[0]]:g}: the thrusters' own forces show no inertia in that direction."
         )
-    surge = sample_time / gains["Xmu"] if thrust_in_newtons else mass * (1 + surge_added_mass)
+    surge = sample_time / gains["Xmu"] if thrust_in_newtons else mass * (1 + SURGE_ADDED_MASS)
     return Inertia(surge, surge * gains["Xmu"] / gains["Ymu"], surge * gains["Xmu"] / gains["Nmu"])
 
 
-def check_ties(theta: Mapping[str, float], sample_time: float, tolerance: float = 0.1) -> list[Tie]:
-    """Compare the relations that Table 3.1 implies: Xvr·Yur = −Ts² and Ymu/Xmu = −Yur/Ts.
-
-    Parameters
-    ----------
-    tolerance : float
-        Relative difference up to which a tie counts as held.
-    """
+def check_ties(theta: Mapping[str, float], sample_time: float) -> list[Tie]:
+    """Compare the relations that Table 3.1 implies: Xvr·Yur = −Ts² and Ymu/Xmu = −Yur/Ts."""
     sides: list[tuple[str, float, float]] = []
     if "Xvr" in theta and "Yur" in theta:
         sides.append(("Xvr·Yur = −Ts²", theta["Xvr"] * theta["Yur"], -(sample_time**2)))
@@ -144,21 +137,10 @@ def check_ties(theta: Mapping[str, float], sample_time: float, tolerance: float 
         )
     ties = []
     for name, value, right in sides:
-        holds = bool(abs(value - right) <= tolerance * max(abs(value), abs(right)))
-        ties.append(
-            Tie(
-                name,
-                value,
-                float(right),
-                holds,
-                f"{name}: {value:.4g} against {right:.4g}"
-                + (
-                    ", holds."
-                    if holds
-                    else ", does not hold: masses from Table 3.1 are only nominal."
-                ),
-            )
-        )
+        holds = bool(abs(value - right) <= _HELD * max(abs(value), abs(right)))
+        says = "holds" if holds else "does not hold: masses from Table 3.1 are only nominal"
+        sentence = f"{name}: {value:.4g} against {right:.4g}, {says}."
+        ties.append(Tie(name, value, float(right), holds, sentence))
     return ties
 
 

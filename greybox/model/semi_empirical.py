@@ -149,7 +149,7 @@ class LinearDerivatives:
     N_r: float
 
 
-def semi_empirical_model(vessel: Vessel, sample_time: float | None = None) -> ManoeuvringModel:
+def semi_empirical_model(vessel: Vessel) -> ManoeuvringModel:
     """Return a model of structure ``thesis`` from main dimensions and thrusters alone.
 
     Parameters
@@ -157,15 +157,13 @@ def semi_empirical_model(vessel: Vessel, sample_time: float | None = None) -> Ma
     vessel : Vessel
         Length, and where known beam, draught (of `conditions`), mass and service speed; the
         places, thrust laws and speed limits of its thrusters.
-    sample_time : float, optional
-        Ts [s]; by default a tenth of the time in which the ship sails its length, as a round
-        number of 1 s at most.
 
     Returns
     -------
     ManoeuvringModel
-        With a covariance that is diagonal: (relative spread × value)² plus a floor. Its record
-        says under ``notes`` what was assumed.
+        Sampled by a tenth of the time in which the ship sails its length, as a round number of
+        1 s at most. With a covariance that is diagonal: (relative spread × value)² plus a
+        floor. Its record says under ``notes`` what was assumed.
 
     Raises
     ------
@@ -190,7 +188,7 @@ def semi_empirical_model(vessel: Vessel, sample_time: float | None = None) -> Ma
     Straight-line stability is not enforced: full tankers have none.
     """
     hull = main_dimensions(vessel)
-    step = sample_time or _sample_time(hull)
+    step = _sample_time(hull)
     structure = structure_for("thesis", force_inputs(vessel))
     linear = clarke_derivatives(hull)
     spin = hull.mass * (_GYRADIUS * hull.length) ** 2
@@ -223,7 +221,7 @@ def semi_empirical_model(vessel: Vessel, sample_time: float | None = None) -> Ma
         "Ymu": gain / inertia[0, 0],
         "Nmu": gain / inertia[1, 1],
         **_wind_terms(hull, surge, inertia),
-        **_rudder_terms(vessel, hull, surge, push, gain, drag),
+        **_rudder_terms(vessel, hull, surge, push, gain),
     }
     theta = step * np.array([rates.get(n, 0.0) for n in structure.parameters])
     std = _standard_errors(structure, theta, vessel, hull)
@@ -511,7 +509,7 @@ def _wind_terms(hull: MainDimensions, surge: float, inertia: Array) -> dict[str,
 
 
 def _rudder_terms(
-    vessel: Vessel, hull: MainDimensions, surge: float, push: Array, gain: float, drag: float
+    vessel: Vessel, hull: MainDimensions, surge: float, push: Array, gain: float
 ) -> dict[str, float]:
     """Return the terms of rudders behind propellers.
 

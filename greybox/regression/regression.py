@@ -80,7 +80,6 @@ def build_regression(
     logs: Sequence[TrialLog],
     *,
     margins: Mapping[str, float] | None = None,
-    second_measurement: Sequence[Array] | None = None,
 ) -> Regression:
     """Form y and Φ from measured logs.
 
@@ -91,9 +90,6 @@ def build_regression(
         One experiment each, of one sample time.
     margins : dict of str to float, optional
         Rows with a measured |state| below its margin are left out (Remark 4.2).
-    second_measurement : sequence of ndarray, optional
-        (N, nx) per log, measurements y2 of the disturbance: the regressors then see
-        y1 + y2 while y stays y1 (4.13), (4.14).
 
     Raises
     ------
@@ -104,15 +100,11 @@ def build_regression(
 
     References
     ----------
-    Ljungberg (2020), eqs. 4.3, 4.5, 4.13.
+    Ljungberg (2020), eqs. 4.3, 4.5.
     """
     sample_time = common_sample_time(logs)
-    second: Sequence[Array | None] = second_measurement or [None] * len(logs)
-    experiments = [
-        build_experiment(predictor, log, margins=margins, second_measurement=other)
-        for log, other in zip(logs, second, strict=True)
-    ]
-    regression = Regression(predictor, tuple(experiments), sample_time)
+    experiments = tuple(build_experiment(predictor, log, margins=margins) for log in logs)
+    regression = Regression(predictor, experiments, sample_time)
     most = max(len(predictor.equation(s)) for s in predictor.structure.states)
     if regression.kept <= 2 * most:
         raise ExcitationError(
@@ -124,11 +116,7 @@ def build_regression(
 
 
 def build_experiment(
-    predictor: Predictor,
-    log: TrialLog,
-    *,
-    margins: Mapping[str, float] | None = None,
-    second_measurement: Array | None = None,
+    predictor: Predictor, log: TrialLog, *, margins: Mapping[str, float] | None = None
 ) -> Experiment:
     """Form the rows of one log; parameters and errors as `build_regression`."""
     structure = predictor.structure
@@ -139,10 +127,9 @@ def build_experiment(
         )
     x = log.states(structure.states)
     y = (np.diff(x, axis=0) if structure.increment else x[1:]).T
-    measured = x if second_measurement is None else x + second_measurement
     given = LogInputs.of(structure, log)
     phi = predictor.evaluate(
-        [np.ascontiguousarray(measured[:-1, j]) for j in range(measured.shape[1])],
+        [np.ascontiguousarray(x[:-1, j]) for j in range(x.shape[1])],
         given.psi[:-1],
         list(given.tau[:-1].T),
         (log["u_q"][:-1], log["v_q"][:-1]) if predictor.air_measured else None,

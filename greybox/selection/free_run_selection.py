@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import ExcitationError
-from greybox.estimation.fixed_gain_observer import ObservedRuns
 from greybox.estimation.free_run import changes
+from greybox.estimation.innovations import ObservedRuns
 from greybox.estimation.output_setup import deviations, measured, output_model, output_predictor
 from greybox.estimation.shooting import (
     RANK,
@@ -342,7 +342,7 @@ class FreeRunSelection:
                 return self._at(runs, p, cost, known)
         return None
 
-    def _fitted(self, runs: _Runs, p: Array, active: Sequence[int], most: int = _FIRST) -> _Point:
+    def _fitted(self, runs: _Runs, p: Array, active: Sequence[int]) -> _Point:
         """Return the fit of the active parameters, Levenberg-Marquardt where steps fail."""
         index = np.array(active)
         out = np.setdiff1d(np.arange(len(p)), index)
@@ -353,7 +353,7 @@ class FreeRunSelection:
             p = np.zeros_like(p)
             cost = self._value(runs, p)
         at = self._at(runs, p, cost, index.tolist())
-        for _ in range(most):
+        for _ in range(_FIRST):
             require_time()
             moved = self._damped(runs, at, index)
             if moved is None:

@@ -146,7 +146,7 @@ def draw(stream: LogStream, structure: Structure) -> Drawn:
         log if stop - start == len(log) else log.window(start, stop)
         for log, (_, start, stop) in zip(whole, chosen, strict=True)
     )
-    return Drawn(stream, logs, _data(stream, logs[0], [s for _, s in found], structure))
+    return Drawn(stream, logs, _data(stream, logs[0], [s for _, s in found]))
 
 
 def _look_at(predictor: Predictor, log: TrialLog) -> _Segment:
@@ -194,9 +194,7 @@ def _greedy(moments: Array, count: int) -> list[int]:
     return order
 
 
-def _data(
-    stream: LogStream, log: TrialLog, segments: Sequence[_Segment], structure: Structure
-) -> EstimationData:
+def _data(stream: LogStream, log: TrialLog, segments: Sequence[_Segment]) -> EstimationData:
     """Return what is known of all files; rows that take part are counted by the estimate."""
     found: dict[str, tuple[float, float]] = {}
     for segment in segments:

@@ -17,7 +17,6 @@ from greybox.estimation.prediction_verdict import (
     Elsewhere,
     JudgedOn,
     NoBands,
-    PredictionLimits,
     PredictionVerdict,
     RefitsDiverge,
     RunsDiverge,
@@ -76,7 +75,6 @@ def judge_prediction(
     own: Sequence[HeldOut] = (),
     elsewhere: Sequence[HeldOut] = (),
     kinds: Sequence[str] = (),
-    limits: PredictionLimits = LIMITS,
     seed: int = 0,
     errors: Sequence[RunErrors | None] | None = None,
 ) -> PredictionVerdict:
@@ -99,7 +97,6 @@ def judge_prediction(
         what its logs show.
     kinds : sequence of str
         Of manoeuvres that were left out in `elsewhere`, none where logs were.
-    limits : PredictionLimits
     seed : int
         Of the draws of the bands.
     errors : sequence of RunErrors or None, optional
@@ -130,7 +127,7 @@ def judge_prediction(
             for left, mine in ((spread, whole), (rmse, fitted))
         )
     noise = _noise(held, states)
-    moves = _moves(runs, states, spread, noise, held[0].model.vessel.length, limits)
+    moves = _moves(runs, states, spread, noise, held[0].model.vessel.length)
     longest = max(float(part.t[-1] - part.t[0]) for r in runs for part in split_segments(r.log))
     beaten = moves & ~(rmse <= spread)
     horizon = _horizons(held, spread) if beaten.any() else np.full(len(states), longest)
@@ -167,7 +164,7 @@ def judge_prediction(
     lost = sum(r.diverged >= 0 for r in apart)
     with np.errstate(divide="ignore", invalid="ignore"):
         beyond = {s: float(v) for s, v, m in zip(states, far / wide, moves, strict=True) if m}
-    if apart and (lost or any(not v <= limits.good for v in beyond.values())):
+    if apart and (lost or any(not v <= LIMITS.good for v in beyond.values())):
         reasons.append(Elsewhere(tuple(kinds), len(own) > 1, beyond, lost, len(apart)))
     return weigh_prediction(
         channels,
@@ -176,7 +173,6 @@ def judge_prediction(
         parts=parts,
         samples=sum(len(r.log) for r in runs),
         found=[*reasons, *told],
-        limits=limits,
     )
 
 
@@ -269,15 +265,14 @@ def _moves(
     spread: Array,
     noise: Array,
     length: float,
-    limits: PredictionLimits,
 ) -> NDArray[np.bool_]:
     """Return which channels move beyond their noise, and enough to matter beside the speed."""
-    least = limits.noise * np.nan_to_num(noise)
+    least = LIMITS.noise * np.nan_to_num(noise)
     if {"u", "v"} <= set(states):
         way = np.concatenate([r.log.states(("u", "v")) for r in runs])
         speed = float(np.sqrt((way**2).sum(axis=1).mean()))
         of = {"u": speed, "v": speed, "r": speed / length}
-        least = np.maximum(least, [limits.speed * of.get(s, 0.0) for s in states])
+        least = np.maximum(least, [LIMITS.speed * of.get(s, 0.0) for s in states])
     return np.asarray((spread > least) & (spread > 0))
 
 

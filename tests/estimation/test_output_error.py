@@ -11,7 +11,7 @@ from virtual import virtual_log, write_csv
 
 from greybox.commands.main import main
 from greybox.errors import ExcitationError, StructureError, UsageError
-from greybox.estimation import free_run, free_run_noise, output_error
+from greybox.estimation import free_run, free_run_errors, output_error
 from greybox.estimation.efficiency_bounds import _limit, cramer_rao, information, noise_variances
 from greybox.estimation.free_run import _follows, fit_free_runs
 from greybox.estimation.free_run_errors import (
@@ -91,10 +91,10 @@ def test_levels_that_have_no_weight_are_not_tried(monkeypatch):
     seen = 0.05 * rng.standard_normal(400)
     best = np.array([(seen**2).mean()])
     runs = Runs()
-    mean = free_run_noise.mean_variance(runs, None, None, best, 0, 1.0)
+    mean = free_run_errors.mean_variance(runs, None, None, best, 0, 1.0)
     assert runs.tried < 12
-    monkeypatch.setattr(free_run_noise, "_UNLIKELY", np.inf)
-    every = free_run_noise.mean_variance(runs, None, None, best, 0, 1.0)
+    monkeypatch.setattr(free_run_errors, "_UNLIKELY", np.inf)
+    every = free_run_errors.mean_variance(runs, None, None, best, 0, 1.0)
     # 400 squares, flat in the logarithm: inverse gamma, with the mean n/(n − 2) of the best;
     # twelve levels are interpolated, which is right to a small part of its deviation of 7 %
     for found in (mean, every):
@@ -106,7 +106,7 @@ def test_a_likelihood_sharper_than_its_grid_has_its_best_level_as_mean():
         def filtered(self, p, nodes, noise):
             return 1e6 * (np.sqrt(noise) - 0.05), np.zeros(1)
 
-    found = free_run_noise.mean_variance(Runs(), None, None, np.array([0.05**2]), 0, 1.0)
+    found = free_run_errors.mean_variance(Runs(), None, None, np.array([0.05**2]), 0, 1.0)
     assert found == pytest.approx(0.05**2)
 
 
@@ -115,7 +115,7 @@ def test_levels_under_which_the_run_escapes_have_no_weight():
         def filtered(self, p, nodes, noise):
             return np.where(noise < 1e-3, 1e200, 1.0), np.log(noise)
 
-    found = free_run_noise.mean_variance(Runs(), None, None, np.array([0.05**2]), 0, 1.0)
+    found = free_run_errors.mean_variance(Runs(), None, None, np.array([0.05**2]), 0, 1.0)
     assert 1e-3 < found < 10.0
 
 

@@ -21,7 +21,7 @@ from greybox.estimation.noise import (
     first_levels,
     fit_noise,
 )
-from greybox.estimation.refined import estimate_refined_iv, with_noise
+from greybox.estimation.refined import add_noise, estimate_refined_iv
 from greybox.estimation.summary import weak_safe_sets
 from greybox.model.catalogue import get_structure
 from greybox.model.model import model_from_dict
@@ -30,6 +30,7 @@ from greybox.model.predictor import build_predictor
 from greybox.model.run.simulation import stationary_disturbance
 from greybox.numerics.banded import factor_band
 from greybox.regression.motion import predicted_motion, smoothed_heading
+from greybox.regression.problem import RegressionProblem
 from greybox.regression.regression import build_regression
 from greybox.selection.fit_single import estimate_iv, estimate_ls, estimate_once
 from greybox.selection.request import Request
@@ -304,7 +305,8 @@ def test_slopes_of_the_likelihood_equal_differences(own, memory, restricted):
 
 
 def test_plain_estimates_keep_noise_levels(basic, still_log):
-    estimate = with_noise(estimate_iv(basic, [still_log]), [still_log])
+    problem = RegressionProblem(basic, (still_log,))
+    estimate = add_noise(problem, estimate_iv(basic, [still_log]))
     assert estimate.prefilter == "none"
     np.testing.assert_allclose(estimate.noise.measurement, 0.014142)
 
@@ -363,7 +365,7 @@ def test_the_choice_says_why_it_does_not_refine(thesis, still_log):
 def test_a_prediction_that_diverges_is_an_error(basic, still_log, refined, monkeypatch):
     plain = estimate_iv(basic, [still_log])
     wild = replace(plain, theta=1e3 * plain.theta)
-    assert with_noise(wild, [still_log]).noise is None
+    assert add_noise(RegressionProblem(basic, (still_log,)), wild).noise is None
     # least squares serves as a start where the plain estimate cannot be simulated
     again = estimate_refined_iv(basic, [still_log], start=wild)
     assert (np.abs(again.theta - refined.theta) < 0.05 * refined.std).all()

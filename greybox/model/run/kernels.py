@@ -128,9 +128,7 @@ def unrolled(step: ca.Function, carried: int, steps: int) -> ca.Function:
     return ca.Function("steps", arguments, [*current, *columns])
 
 
-def accumulate(
-    step: ca.Function, count: int, carried: Sequence[int] = (0,), name: str = "run"
-) -> ca.Function:
+def accumulate(step: ca.Function, count: int, carried: Sequence[int] = (0,)) -> ca.Function:
     """Return a step taken many times, as two nested loops of about equal length.
 
     Of 5000 steps with sensitivities that is built in half the time of ten by ten, and run
@@ -143,10 +141,9 @@ def accumulate(
         How often.
     carried : sequence of int
         Arguments that a step hands to the next one, first among its results too.
-    name : str
     """
     base = max(_LEAST_BASE, math.isqrt(count) + 1)
-    return step.mapaccum(name, count, list(carried), list(range(len(carried))), {"base": base})
+    return step.mapaccum("run", count, list(carried), list(range(len(carried))), {"base": base})
 
 
 def _block(step: ca.Function) -> int:

@@ -33,6 +33,8 @@ NAMES = ("x_n", "y_n", "psi", "u", "v", "r")
 _MAX_SAMPLES = 40_000
 _MAX_STRETCHES = 30
 _MIN_STRETCH = 20
+# of an excerpt
+_PIECES = 8
 _ROBUST = 4.0
 # reach of the kernels that are tried against noise, and samples left out beside each
 _MOST_TAPS = 90
@@ -70,14 +72,14 @@ class Motion:
     def __len__(self) -> int:
         return len(self.t)
 
-    def excerpt(self, samples: int, pieces: int = 8) -> Motion:
+    def excerpt(self, samples: int) -> Motion:
         """Return at most about `samples` samples, in pieces spread over the log."""
         if len(self) <= samples:
             return self
-        size = samples // pieces
+        size = samples // _PIECES
         parts = []
-        for k in range(pieces):
-            start = round(k * (len(self) - size) / (pieces - 1))
+        for k in range(_PIECES):
+            start = round(k * (len(self) - size) / (_PIECES - 1))
             a, b = next((s for s in self.stretches if s[0] <= start < s[1]), self.stretches[-1])
             a, b = max(start, a), min(start + size, b)
             if b - a >= _MIN_STRETCH:
