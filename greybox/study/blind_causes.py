@@ -79,6 +79,19 @@ class Kind:
     act: Act = keep
 
 
+def setting(**fields: str | tuple[str, ...]) -> Act:
+    """Return what gives fields of the ship the effect's parameters, one or several, of a name."""
+
+    def act(ship: Ship, effect: Effect, later: bool) -> Ship:
+        given: dict[str, Any] = {
+            field: effect.number(n) if isinstance(n, str) else tuple(map(effect.number, n))
+            for field, n in fields.items()
+        }
+        return replace(ship, **given)
+
+    return act
+
+
 def _signed(rng: np.random.Generator, low: float, high: float) -> float:
     return float(rng.choice([-1.0, 1.0]) * rng.uniform(low, high))
 
@@ -91,12 +104,6 @@ def uniform(name: str, low: float, high: float) -> Draw:
 def _current(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
     speed, towards = size * rng.uniform(0.2, 0.45), rng.uniform(0, 2 * np.pi)
     return {"current_north": speed * np.cos(towards), "current_east": speed * np.sin(towards)}
-
-
-def _in_current(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(
-        ship, current=(effect.number("current_north"), effect.number("current_east"))
-    )  # fmt: skip
 
 
 def _wind(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
@@ -134,30 +141,12 @@ def _delay(rng: np.random.Generator, size: float, typical: Typical) -> dict[str,
     return {"delay": round(size * rng.uniform(3, 7), 1)}
 
 
-def _delayed(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(ship, delay=effect.number("delay"))
-
-
 def _with_own(ship: Ship, field: str, column: str, value: float) -> Ship:
     """Return the ship with one command that acts otherwise than the others."""
     own = list(getattr(ship, field))
     own[COLUMNS.index(column)] = value
     changed: dict[str, Any] = {field: tuple(own)}
     return replace(ship, **changed)
-
-
-def _one_slow(column: str) -> Kind:
-    def act(ship: Ship, effect: Effect, later: bool) -> Ship:
-        return _with_own(ship, "own_lag", column, effect.number("lag"))
-
-    return Kind(uniform("lag", 4, 9), act)
-
-
-def _one_late(column: str) -> Kind:
-    def act(ship: Ship, effect: Effect, later: bool) -> Ship:
-        return _with_own(ship, "own_delay", column, effect.number("delay"))
-
-    return Kind(_delay, act)
 
 
 def _rate(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
@@ -175,24 +164,10 @@ def _unheld(rng: np.random.Generator, size: float, typical: Typical) -> dict[str
     return {"interpolated": float(size > 0)}
 
 
-def _moving(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(ship, moving=effect.number("interpolated"))
-
-
 def _quadratic(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
     speed = np.abs(typical.commands[:, :2])
     # the share is counted at the propellers' middle speed, as the cause counts it
     return {"quadratic_share": size, "reference": float(np.median(speed, axis=0).mean())}
-
-
-def _squared(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(
-        ship, quadratic=effect.number("quadratic_share"), reference=effect.number("reference")
-    )
-
-
-def _advancing(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(ship, advance=effect.number("loss"))
 
 
 def _relative(*names: str) -> Draw:
@@ -297,15 +272,17 @@ def _sign(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, 
 
 
 CAUSES: dict[str, Kind] = {
-    "current": Kind(_current, _in_current),
+    "current": Kind(_current, setting(current=("current_north", "current_east"))),
     "wind": Kind(_wind),
     "thruster_gain": Kind(_gain, _weak),
     "thruster_lag": Kind(_lag, _lagged),
-    "input_delay": Kind(_delay, _delayed),
+    "input_delay": Kind(_delay, setting(delay="delay")),
     "rate_limit": Kind(_rate, _rate_limited),
-    "feedback_sampling": Kind(_unheld, _moving),
-    "quadratic_thrust": Kind(_quadratic, _squared),
-    "advance_speed": Kind(uniform("loss", 0.04, 0.12), _advancing),
+    "feedback_sampling": Kind(_unheld, setting(moving="interpolated")),
+    "quadratic_thrust": Kind(
+        _quadratic, setting(quadratic="quadratic_share", reference="reference")
+    ),
+    "advance_speed": Kind(uniform("loss", 0.04, 0.12), setting(advance="loss")),
     "cubic_damping": Kind(_relative("X_uuu", "Y_vvv", "N_rrr"), with_terms),
     "quadratic_yaw_damping": Kind(_relative("N_|r|r"), with_terms),
     "crossflow": Kind(_relative("Y_|r|r", "Y_|r|v", "N_|r|v"), with_terms),
@@ -320,9 +297,21 @@ CAUSES: dict[str, Kind] = {
     "waves": Kind(_waves),
     "sign": Kind(_sign),
 }
+
+
+def _of_one(draw: Draw, field: str, name: str, column: str) -> Kind:
+    def act(ship: Ship, effect: Effect, later: bool) -> Ship:
+        return _with_own(ship, field, column, effect.number(name))
+
+    return Kind(draw, act)
+
+
 # lag and delay of one command, by the id and place that a diagnosis tells
 OF_ONE: dict[str, Kind] = {
-    f"{cause}:{column}": kind(column)
-    for cause, kind in (("thruster_lag", _one_slow), ("input_delay", _one_late))
+    f"{cause}:{column}": _of_one(draw, field, name, column)
+    for cause, draw, field, name in (
+        ("thruster_lag", uniform("lag", 4, 9), "own_lag", "lag"),
+        ("input_delay", _delay, "own_delay", "delay"),
+    )
     for column in COLUMNS
 }

@@ -14,6 +14,7 @@ from greybox.study.blind_causes import (
     Kind,
     Typical,
     Value,
+    setting,
     uniform,
     with_terms,
 )
@@ -26,10 +27,6 @@ def _dead_band(rng: np.random.Generator, size: float, typical: Typical) -> dict[
     return {"dead_band": float(np.quantile(speed, size * rng.uniform(0.2, 0.4)))}
 
 
-def _stalled(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(ship, dead_band=effect.number("dead_band"))
-
-
 def _interaction(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
     return {
         "loss": size * rng.uniform(0.4, 0.8),
@@ -38,17 +35,8 @@ def _interaction(rng: np.random.Generator, size: float, typical: Typical) -> dic
     }
 
 
-def _in_race(ship: Ship, effect: Effect, later: bool) -> Ship:
-    loss, centre, width = (effect.number(n) for n in ("loss", "centre", "width"))
-    return replace(ship, interaction=(loss, centre, width))
-
-
 def _backlash(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
     return {"half_play": size * np.radians(rng.uniform(10, 15)) / 2}
-
-
-def _slack(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(ship, backlash=effect.number("half_play"))
 
 
 def _slow_force(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
@@ -60,17 +48,6 @@ def _slow_force(rng: np.random.Generator, size: float, typical: Typical) -> dict
     }
 
 
-def _swelled(ship: Ship, effect: Effect, later: bool) -> Ship:
-    amplitude, period, towards, phase = (
-        effect.number(n) for n in ("amplitude", "period", "towards", "phase")
-    )
-    return replace(ship, swell=(amplitude, period, towards, phase))
-
-
-def _uneven(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(ship, unevenness=effect.number("unevenness"))
-
-
 def _shallow(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
     low, high = np.quantile(np.abs(typical.surge), [0.6, 0.95])
     ratio = size * rng.uniform(1.0, 2.0)
@@ -80,18 +57,14 @@ def _shallow(rng: np.random.Generator, size: float, typical: Typical) -> dict[st
     }
 
 
-def _over_shoal(ship: Ship, effect: Effect, later: bool) -> Ship:
-    return replace(ship, shallow=(effect.number("coefficient"), effect.number("threshold")))
-
-
 # none of these is a cause that has a name: they are to be found, not to be named
 UNKNOWN: dict[str, Kind] = {
-    "dead_band": Kind(_dead_band, _stalled),
-    "interaction": Kind(_interaction, _in_race),
-    "backlash": Kind(_backlash, _slack),
-    "slow_force": Kind(_slow_force, _swelled),
-    "uneven_damping": Kind(uniform("unevenness", 0.5, 1.5), _uneven),
-    "shallow": Kind(_shallow, _over_shoal),
+    "dead_band": Kind(_dead_band, setting(dead_band="dead_band")),
+    "interaction": Kind(_interaction, setting(interaction=("loss", "centre", "width"))),
+    "backlash": Kind(_backlash, setting(backlash="half_play")),
+    "slow_force": Kind(_slow_force, setting(swell=("amplitude", "period", "towards", "phase"))),
+    "uneven_damping": Kind(uniform("unevenness", 0.5, 1.5), setting(unevenness="unevenness")),
+    "shallow": Kind(_shallow, setting(shallow=("coefficient", "threshold"))),
 }
 EFFECTS = CAUSES | OF_ONE | UNKNOWN
 # those that add terms to the equations, so that several may stand together

@@ -105,12 +105,10 @@ def virtual_batch(rng: np.random.Generator, case: MonteCarloSet, runs: int, samp
     return Batch(y1, 0.0, given[None, :, None], None, np.zeros(1), measured)
 
 
-def _piece(
-    piece: tuple[int, int, int], seed: int, samples: int
-) -> tuple[int, dict[str, Array], int]:
+def _piece(piece: tuple[int, int, int], seed: int) -> tuple[int, dict[str, Array], int]:
     which, chunk, runs = piece
     rng = np.random.default_rng([seed, which, chunk])
-    batch = virtual_batch(rng, SETS[which], runs, samples)
+    batch = virtual_batch(rng, SETS[which], runs, SAMPLES)
     regression = BatchRegression(build_predictor(get_structure("siso"), "basic"), batch)
     ls = regression.least_squares()
     iv = {
@@ -129,9 +127,8 @@ def reproduce_chapter4(
     runs: int = 500,
     seed: int = 0,
     *,
-    samples: int = SAMPLES,
     workers: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Chapter4:
     """Repeat the four Monte Carlo sets of chapter 4.
 
@@ -141,11 +138,9 @@ def reproduce_chapter4(
         Runs a set.
     seed : int
         Draws the noise.
-    samples : int
-        N a run.
     workers : int, optional
         Processes; by default one a processor.
-    progress : callable, optional
+    progress : callable
         Called with runs done and runs in all.
 
     Returns
@@ -163,12 +158,11 @@ def reproduce_chapter4(
     ]
     found: dict[tuple[str, str], list[Array]] = {}
     unconverged, done = 0, 0
-    work = partial(_piece, seed=seed, samples=samples)
+    work = partial(_piece, seed=seed)
     for which, errors, bad in map_pieces(work, pieces, workers=workers):
         for name in ESTIMATORS:
             found.setdefault((SETS[which].figures, name), []).append(errors[name])
         unconverged += bad
         done += len(errors["LS"])
-        if progress is not None:
-            progress(done, runs * len(SETS))
+        progress(done, runs * len(SETS))
     return Chapter4(runs, {k: np.concatenate(v) for k, v in found.items()}, unconverged)

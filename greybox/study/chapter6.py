@@ -60,8 +60,10 @@ TABLES = {
     (10, "IV1"): "6.6", (10, "IV2"): "6.6", (10, "LS3"): "6.7", (10, "IV3"): "6.7",
 }  # fmt: skip
 
-# length of the window that rounds the pulses [samples]
-_SMOOTHING = 30
+# mean winds on each axis [m/s]; log lengths of Figures 6.2 and 6.3
+_WINDS, _LENGTHS = (1, 10), (1000, 2000, 3000, 4000, 5000)
+# length of the window that rounds the pulses [samples], and of the zig-zag that models are run on
+_SMOOTHING, _VALIDATION = 30, 600
 _CHUNK = 64
 _REGIME = (("u", (1,)), ("v", (1,)), ("r", (1, -1)))
 
@@ -152,8 +154,9 @@ def pulse_forces(samples: int) -> Array:
     return np.column_stack([made[n] for n in get_structure("thesis").inputs])
 
 
-def validation_run(samples: int = 600) -> tuple[Array, Array]:
+def validation_run() -> tuple[Array, Array]:
     """Return forces (N, 3) and true states (N+1, 3) of an undisturbed zig-zag ahead."""
+    samples = _VALIDATION
     angle = zig_zag(samples, 1.0, amplitude=0.35, period=100.0)
     speed = zig_zag(samples, 1.0, amplitude=4.0, period=240.0, centre=14.0)
     made = generalised_force(
@@ -238,14 +241,15 @@ def estimate_batch(batch: Batch) -> dict[str, tuple[Array, Array, NDArray[np.boo
     return {name: found[name] for name in ("LS1", "LS2", "LS3", "IV1", "IV2", "IV3")}
 
 
-def _truncated(batch: Batch, samples: int) -> Batch:
+def _part(batch: Batch, runs: int, samples: int) -> Batch:
+    """Return the first samples of the first runs."""
     assert isinstance(batch.psi, np.ndarray)
     assert batch.air is not None
     return Batch(
-        batch.x[:, : samples + 1],
-        batch.psi[:, : samples + 1],
+        batch.x[:runs, : samples + 1],
+        batch.psi[:runs, : samples + 1],
         batch.tau[:, :samples],
-        (batch.air[0][:, :samples], batch.air[1][:, :samples]),
+        (batch.air[0][:runs, :samples], batch.air[1][:runs, :samples]),
         batch.start,
     )
 
@@ -259,33 +263,22 @@ class _Piece:
 
 
 def _piece(
-    piece: _Piece, seed: int, samples: int, lengths: tuple[int, ...]
+    piece: _Piece, seed: int, samples: int
 ) -> tuple[_Piece, dict[str, tuple[Array, int]], dict[str, Array]]:
     rng = np.random.default_rng([seed, piece.wind, piece.chunk])
     batch = virtual_batch(rng, piece.runs, samples, piece.wind, pulse_forces(samples))
     found = estimate_batch(batch)
     theta = {k: (parameters, int(bad.sum())) for k, (parameters, _, bad) in found.items()}
-    fits: dict[str, Array] = {}
+    fits: dict[str, list[Array]] = {}
     if piece.fit_runs:
         tau, x = validation_run()
-        for length in lengths:
+        for length in _LENGTHS:
             models = found
-            if length < samples or piece.fit_runs < piece.runs:
-                part = _truncated(batch, length)
-                part = Batch(
-                    part.x[: piece.fit_runs],
-                    part.psi[: piece.fit_runs] if isinstance(part.psi, np.ndarray) else part.psi,
-                    part.tau,
-                    None
-                    if part.air is None
-                    else (part.air[0][: piece.fit_runs], part.air[1][: piece.fit_runs]),
-                    part.start,
-                )
-                models = estimate_batch(part) if length < samples else models
+            if length < samples:
+                models = estimate_batch(_part(batch, piece.fit_runs, length))
             for name, (_, model, _) in models.items():
-                fit = _validation_fit(model[: piece.fit_runs], tau, x)
-                fits[name] = np.concatenate([fits[name], fit[None]]) if name in fits else fit[None]
-    return piece, theta, fits
+                fits.setdefault(name, []).append(_validation_fit(model[: piece.fit_runs], tau, x))
+    return piece, theta, {name: np.array(fit) for name, fit in fits.items()}
 
 
 def _validation_fit(theta: Array, tau: Array, x: Array) -> Array:
@@ -309,11 +302,9 @@ def reproduce_chapter6(
     seed: int = 0,
     *,
     samples: int = 5000,
-    winds: tuple[int, ...] = (1, 10),
     fit_runs: int = 100,
-    lengths: tuple[int, ...] = (1000, 2000, 3000, 4000, 5000),
     workers: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Chapter6:
     """Repeat the Monte Carlo study of chapter 6.
 
@@ -325,13 +316,11 @@ def reproduce_chapter6(
         Draws the noise.
     samples : int
         N a run.
-    winds : tuple of int
-        Mean wind on each axis [m/s].
-    fit_runs, lengths
-        Runs and log lengths of Figures 6.2 and 6.3; no runs, no figures.
+    fit_runs : int
+        Runs of Figures 6.2 and 6.3; no runs, no figures.
     workers : int, optional
         Processes; by default one a processor.
-    progress : callable, optional
+    progress : callable
         Called with runs done and runs in all.
 
     Returns
@@ -343,7 +332,7 @@ def reproduce_chapter6(
     Ljungberg (2020), chapter 6.
     """
     pieces = []
-    for wind in winds:
+    for wind in _WINDS:
         left = fit_runs
         for chunk, first in enumerate(range(0, runs, _CHUNK)):
             size = min(_CHUNK, runs - first)
@@ -354,7 +343,7 @@ def reproduce_chapter6(
     fits: dict[tuple[int, str], list[Array]] = {}
     unconverged: dict[tuple[int, str], int] = {}
     done = 0
-    work = partial(_piece, seed=seed, samples=samples, lengths=lengths)
+    work = partial(_piece, seed=seed, samples=samples)
     for piece, found, fitted in map_pieces(work, pieces, workers=workers):
         for name, (parameters, bad) in found.items():
             theta.setdefault((piece.wind, name), []).append(parameters)
@@ -362,10 +351,9 @@ def reproduce_chapter6(
         for name, fit in fitted.items():
             fits.setdefault((piece.wind, name), []).append(fit)
         done += piece.runs
-        if progress is not None:
-            progress(done, runs * len(winds))
+        progress(done, runs * len(_WINDS))
     example = virtual_batch(
-        np.random.default_rng([seed, winds[0], 0]), 1, samples, winds[0], pulse_forces(samples)
+        np.random.default_rng([seed, _WINDS[0], 0]), 1, samples, _WINDS[0], pulse_forces(samples)
     )
     assert isinstance(example.psi, np.ndarray)
     assert example.air is not None
@@ -376,7 +364,7 @@ def reproduce_chapter6(
         {k: tuple(c.label for c in p.columns if not c.is_bias) for k, p in predictors().items()},
         unconverged,
         {k: np.concatenate(v, axis=1) for k, v in fits.items()},
-        lengths,
+        _LENGTHS,
         {
             "u": example.x[0, :, 0],
             "v": example.x[0, :, 1],

@@ -126,18 +126,12 @@ def predictors(structure: Structure, wind: bool) -> dict[str, Predictor]:
     return found
 
 
-def estimation_sets(logs: Sequence[TrialLog], most: int = MOST_SETS) -> list[list[TrialLog]]:
+def estimation_sets(logs: Sequence[TrialLog]) -> list[list[TrialLog]]:
     """Form overlapping estimation sets, balanced between surge and sway excitation.
 
     As the thesis: with six logs, two of the three with most surge and two of
     the three with most sway, nine sets. With fewer logs one is left out at a
-    time; a single log is a set of its own.
-
-    Parameters
-    ----------
-    logs : sequence of TrialLog
-    most : int
-        Sets at most.
+    time; a single log is a set of its own. There are at most `MOST_SETS`.
     """
     if len(logs) < 2:
         return [list(logs)]
@@ -150,7 +144,7 @@ def estimation_sets(logs: Sequence[TrialLog], most: int = MOST_SETS) -> list[lis
         combinations(surge_logs, max(1, len(surge_logs) - 1)),
         combinations(sway_logs, max(1, len(sway_logs) - 1)),
     )
-    return [[*a, *b] for a, b in pairs][:most]
+    return [[*a, *b] for a, b in pairs][:MOST_SETS]
 
 
 def _estimates(structure: Structure, logs: list[TrialLog], wind: bool) -> dict[str, Estimate | str]:
@@ -185,7 +179,7 @@ def reproduce_chapter7(
     validation: Sequence[TrialLog],
     *,
     structure: Structure | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Chapter7:
     """Run the pipeline of chapter 7.
 
@@ -195,7 +189,7 @@ def reproduce_chapter7(
         Logs of the two days.
     structure : Structure, optional
         (3.51) by default, without what the thrusters cannot excite.
-    progress : callable, optional
+    progress : callable
         Called with sets done and sets in all.
 
     Returns
@@ -233,8 +227,7 @@ def reproduce_chapter7(
             columns = [c for c in estimate.predictor.columns if not c.is_bias]
             names[name] = tuple(c.label for c in columns)
             theta.setdefault(name, []).append(estimate.theta[estimate.predictor.parameter_columns])
-        if progress is not None:
-            progress(i + 1, len(sets))
+        progress(i + 1, len(sets))
     complete = [n for n in ESTIMATORS if len(fits.get(n, [])) == len(sets)]
     for name in fits:
         if name not in complete:

@@ -7,7 +7,7 @@ with the pooling that is judged but for the model itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -182,7 +182,6 @@ def study_fleets(
     spreads: Sequence[float] = SPREADS,
     deviation: float = ODD,
     seed: int = 0,
-    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[FleetCell, ...]:
     """Judge planted fleets of several sizes and spreads.
 
@@ -197,15 +196,10 @@ def study_fleets(
         Of the odd ship in one coefficient, in standard deviations of error and spread.
     seed : int
         Of the first; the others follow.
-    progress : callable
-        Is told how many fleets are done, and of how many.
     """
     places = [(k, s) for k in ships for s in spreads]
     pieces = [(seed + run, k, s, deviation) for k, s in places for run in range(runs)]
-    outcomes = []
-    for outcome in map_pieces(judge_planted, pieces):
-        outcomes.append(outcome)
-        progress(len(outcomes), len(pieces))
+    outcomes = list(map_pieces(judge_planted, pieces))
     return tuple(
         FleetCell(k, s, tuple(outcomes[i * runs : (i + 1) * runs]))
         for i, (k, s) in enumerate(places)

@@ -18,6 +18,8 @@ from greybox.model.run.simulation import simulate
 
 Array = NDArray[np.float64]
 
+# relative change of every parameter below which a run has converged, and refinements at most
+_TOLERANCE, _MOST = 1e-4, 30
 # values of one array that are worked on together
 _CACHED = 40_000
 # simulated states beyond this multiple of the largest measured one have diverged
@@ -61,13 +63,11 @@ class Batch:
 class BatchEstimate:
     """Estimates of every run.
 
-    ``theta`` (R, p) coefficients of all columns; ``iterations`` the refinements
-    that the slowest run took; ``unconverged`` (R,) runs that never stopped
-    moving or whose instruments diverged.
+    ``theta`` (R, p) coefficients of all columns; ``unconverged`` (R,) runs that never
+    stopped moving or whose instruments diverged.
     """
 
     theta: Array
-    iterations: int
     unconverged: NDArray[np.bool_]
 
 
@@ -201,8 +201,6 @@ class BatchRegression:
         start: Array,
         *,
         zero_mean: bool = True,
-        tolerance: float = 1e-4,
-        most: int = 30,
         again: Array | None = None,
     ) -> BatchEstimate:
         """Estimate by IV, simulating the instruments anew until nothing moves (4.60-4.63).
@@ -211,10 +209,6 @@ class BatchRegression:
         ----------
         start : ndarray
             (R, p_structure) or (p_structure,) models of the first instruments.
-        tolerance : float
-            Relative change of every parameter below which a run has converged.
-        most : int
-            Refinements at most.
         again : ndarray, optional
             (R, p_structure) models from which runs that fail are tried once more.
 
@@ -225,29 +219,21 @@ class BatchRegression:
         every = np.arange(self.batch.runs)
         first = np.broadcast_to(start, (len(every), start.shape[-1]))
         theta = np.full((len(every), len(self.predictor.columns)), np.nan)
-        iterations, failed = self._refine_runs(theta, first, every, zero_mean, tolerance, most)
+        failed = self._refine_runs(theta, first, every, zero_mean)
         if again is not None and failed.any():
-            runs = every[failed]
-            more, still = self._refine_runs(theta, again, runs, zero_mean, tolerance, most)
-            failed, iterations = still, max(iterations, more)
-        return BatchEstimate(theta, iterations, failed | ~np.isfinite(theta).all(axis=1))
+            failed = self._refine_runs(theta, again, every[failed], zero_mean)
+        return BatchEstimate(theta, failed | ~np.isfinite(theta).all(axis=1))
 
     def _refine_runs(
-        self,
-        theta: Array,
-        start: Array,
-        runs: NDArray[np.intp],
-        zero_mean: bool,
-        tolerance: float,
-        most: int,
-    ) -> tuple[int, NDArray[np.bool_]]:
-        """Refine some runs, filling `theta`; return the iterations and who failed, (R,)."""
+        self, theta: Array, start: Array, runs: NDArray[np.intp], zero_mean: bool
+    ) -> NDArray[np.bool_]:
+        """Refine some runs, filling `theta`, and return who failed, (R,)."""
         model = start.copy()
         theta[runs] = np.nan
         failed = np.zeros(self.batch.runs, bool)
         last = model.copy()
         wanted = self.predictor.parameter_columns
-        for iteration in range(most + 1):
+        for iteration in range(_MOST + 1):
             z, bad = self.instruments(model[runs], runs)
             # halfway models settle too, but not at an estimate that can be simulated
             halfway = bad.copy()
@@ -273,12 +259,12 @@ class BatchRegression:
             model[runs] = self.structure_theta(new)
             with np.errstate(invalid="ignore"):
                 change = np.abs(new - old)[:, wanted] / (np.abs(new[:, wanted]) + 1e-12)
-            moving = ~(change.max(axis=1) < tolerance) | halfway[fine]
+            moving = ~(change.max(axis=1) < _TOLERANCE) | halfway[fine]
             runs = runs[moving]
             if not len(runs):
                 break
         failed[runs] = True
-        return iteration, failed
+        return failed
 
     def with_instruments_of(self, theta: Array, doubtful: NDArray[np.bool_]) -> BatchEstimate:
         """Estimate once, with instruments simulated from given models.
@@ -297,7 +283,7 @@ class BatchRegression:
         if fine.any():
             part = z[:, fine] if bad.any() else z
             out[fine] = self.solve(part, runs[fine], zero_mean=True)
-        return BatchEstimate(out, 0, doubtful | bad)
+        return BatchEstimate(out, doubtful | bad)
 
 
 def _solve_scaled(gram: Array, right: Array) -> Array:
