@@ -35,9 +35,11 @@ def cause_section(diagnosis: Diagnosis) -> Section:
     found = _all_found(diagnosis)
     points = [f"{_called(c)}: {c.evidence}." for c in found]
     return Section(
-        "2. The cause" if diagnosis.verdict == DiagnosisVerdict.NAMED else "2. Causes",
+        "2. The cause"
+        if diagnosis.verdict == DiagnosisVerdict.NAMED and len(found) == 1
+        else "2. Causes",
         [told] if told else [],
-        list(_ranking(diagnosis, [c.key for c in found])),
+        list(_ranking(diagnosis, [c.key for c in (*diagnosis.causes, *diagnosis.candidates)])),
         [t for t in (_numbers(found), _proofs(found, diagnosis.tried)) if t],
         points=[*points, *_groups(diagnosis)],
     )
@@ -56,6 +58,8 @@ def _numbers(found: Sequence[Found]) -> Table | None:
     rows = []
     for cause in found:
         for name, q in cause.parameters.items():
+            if not q.std > 0:
+                continue
             value = unbroken(with_error(q.value, q.std))
             unit = shown_unit(q.unit)
             if q.unit == "rad":

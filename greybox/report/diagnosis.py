@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from greybox.diagnosis.result import Diagnosis, Runs, hardly_split
+from greybox.diagnosis.result import Diagnosis, Gain, Runs, hardly_split
 from greybox.report.chart import chart_of
 from greybox.report.diagnosed_causes import cause_section, probability
 from greybox.report.diagnosis_figures import (
@@ -121,16 +121,9 @@ def _remains(diagnosis: Diagnosis) -> Section:
     if remainder is not None:
         told.append(remainder.reason)
         if remainder.gain:
-            rows = [
-                [
-                    _NAMES.get(s, s), _percent(g.before), _percent(g.after),
-                    f"{g.ci[0]:.1f} to {g.ci[1]:.1f}",
-                ]
-                for s, g in remainder.gain.items()
-            ]  # fmt: skip
             caption = f"Fit of the free run (6.12) {remainder.validated_on}"
-            head = ["state", "without that force", "with it", "95 % of the gain"]
-            tables = [Table(caption, head, rows), *tables]
+            without = ("without that force", "with it")
+            tables = [_gain_table(caption, remainder.gain, without), *tables]
     return Section("5. What remains", told, tables=tables)
 
 
@@ -161,8 +154,8 @@ def _wrong(diagnosis: Diagnosis) -> Section:
             )
         if errors.lost:
             sentences.append(
-                f"The free run runs away at {errors.lost} of {errors.samples} samples; "
-                f"mean errors leave these out."
+                f"The free run has ended or runs away at {errors.lost} of {errors.samples} "
+                f"samples; mean errors leave these out."
             )
     return Section(
         "1. What the simulation gets wrong",
@@ -288,25 +281,30 @@ def gain_section(diagnosis: Diagnosis) -> Section:
     """Show what the extended model gains on logs it was not fitted to."""
     if not diagnosis.gain:
         return Section("4. The gain", ["No gain was measured."])
-    table = Table(
-        "Fit (6.12) of the free run [%]",
-        ["state", "before", "after", "gain", "95 % interval"],
-        [
-            [
-                _NAMES.get(s, s), _percent(g.before), _percent(g.after),
-                f"{g.after - g.before:+.1f}" if g.before > -1000 else "",
-                f"{g.ci[0]:.1f} to {g.ci[1]:.1f}",
-            ]
-            for s, g in diagnosis.gain.items()
-        ],
-    )  # fmt: skip
+    tables = [_gain_table("Fit (6.12) of the free run [%]", diagnosis.gain, ("before", "after"))]
+    if diagnosis.gain_over_chosen:
+        heads = ("with these terms", "after")
+        caption = "Fit against the terms that the data chose, which belong to no cause [%]"
+        tables.append(_gain_table(caption, diagnosis.gain_over_chosen, heads))
     caption = "Fit of the free run before and after, with the 95 % interval of the gain."
     if any(min(g.before, g.after) < LOWEST_FIT for g in diagnosis.gain.values()):
         caption += f" Below {LOWEST_FIT:.0f} % it is drawn at the edge."
-    told = "; ".join(f"{r[0]} {r[1]} to {r[2]}" for r in table.rows)
+    told = "; ".join(f"{r[0]} {r[1]} to {r[2]}" for r in tables[0].rows)
     on = diagnosis.validated_on
     picture = narrow(gain_figure(diagnosis.gain), "gain", caption, f"{caption} {told}.")
     return Section(
         "4. The gain", [on[:1].upper() + on[1:].rstrip(".") + "."] if on else [],
-        [picture] if _changed(diagnosis) else [], [table],
+        [picture] if _changed(diagnosis) else [], tables,
     )  # fmt: skip
+
+
+def _gain_table(caption: str, gain: Mapping[str, Gain], heads: tuple[str, str]) -> Table:
+    rows = [
+        [
+            _NAMES.get(s, s), _percent(g.before), _percent(g.after),
+            f"{g.after - g.before:+.1f}" if g.before > -1000 else "",
+            f"{g.ci[0]:.1f} to {g.ci[1]:.1f}",
+        ]
+        for s, g in gain.items()
+    ]  # fmt: skip
+    return Table(caption, ["state", *heads, "gain", "95 % interval"], rows)

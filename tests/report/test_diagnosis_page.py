@@ -236,6 +236,7 @@ def test_named(pages, written, told):
     assert "current_north is 0.2000 ± 0.0040 m/s; before, the water stood still." in shown
     assert "Extension for current: the mean current, north and east." in shown
     assert "43.0 to 50.1" in shown
+    assert pages["named"].sections[1].title == "2. Causes"
     assert "<ins>N_|r|r·|r|·r</ins>" in written["named"]
 
 
@@ -351,6 +352,34 @@ def test_the_command_that_errors_follow_is_shown(told):
     assert "by the command that it goes with most" in told["named"]
 
 
+def test_only_what_the_verdict_names_is_bold(pages):
+    # glyphs of bold names: c of current, _ of heading_bias
+    named, partly = (pages[v].sections[1].pictures[0].svg for v in ("named", "partly"))
+    assert "-Bold-46" in named
+    assert "-Bold-42" in named
+    assert "-Bold-46" in partly
+    assert "-Bold-42" not in partly
+
+
+def test_the_gain_beyond_the_terms_that_the_data_chose(pages):
+    over = {"u": Gain(55.3, 61.4, (5.1, 7.1)), "v": Gain(-2e3, 61.4, (5.1, 7.1))}
+    page = diagnosis_page(replace(diagnosis_of("named"), gain_over_chosen=over), RECORD)
+    tables = page.sections[3].tables
+    assert len(tables) == 1 + len(pages["named"].sections[3].tables)
+    assert "the terms that the data chose" in tables[1].caption
+    assert tables[1].rows[0] == ["surge", "55.3 %", "61.4 %", "+6.1", "5.1 to 7.1"]
+    assert tables[1].rows[1][:4] == ["sway", "diverged", "61.4 %", ""]
+
+
+def test_a_cause_that_is_there_or_not_has_no_number():
+    held = replace(CURRENT, parameters={"interpolated": Quantity(1.0, 0.0, "1")})
+    named = replace(diagnosis_of("named"), causes=(held,))
+    page = diagnosis_page(named, RECORD)
+    assert "interpolated" not in render(page)
+    assert "interpolated" not in named.summary()
+    assert page.sections[1].title == "2. The cause"
+
+
 def test_runs_that_end_before_their_log():
     run = diagnosis_of("named").runs[0]
     short = replace(run, after={s: x[:-5] for s, x in run.after.items()})
@@ -358,6 +387,8 @@ def test_runs_that_end_before_their_log():
     assert errors.lost == 5
     assert (errors.regime[-5:] == -1).all()
     assert errors.regimes == (0,)
+    page = diagnosis_page(replace(diagnosis_of("named"), runs=(short,)), RECORD)
+    assert "The free run has ended or runs away at 5 of 600 samples" in text_of(render(page))
 
 
 @pytest.mark.long
