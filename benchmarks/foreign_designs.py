@@ -32,6 +32,8 @@ from foreign_ships.manoeuvres import (  # type: ignore[import-not-found]
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from benchmarks.foreign_causes import SAMPLE_TIMES
+
 Array = NDArray[np.float64]
 
 SHIPS = (
@@ -40,13 +42,8 @@ SHIPS = (
 )  # fmt: skip
 ARMS = ("random", "zigzag", "plan", "long-random", "long-zigzag")
 OTHERS = tuple(arm for arm in ARMS if arm != "plan")
-# lengths sailed in a trial, its least and its greatest duration [s], seconds between samples
+# lengths sailed in a trial, its least and its greatest duration [s]
 TRIAL, SHORTEST, LONGEST = 60, 300.0, 900.0
-EVERY = {
-    "kvlcc2-7m": 0.5, "kvlcc2-320m": 2.0, "training-ship-105m": 1.0, "esso-osaka-3m": 0.5,
-    "survey-catamaran-1.2m": 0.3, "survey-catamaran-2m": 0.4, "research-catamaran-29m": 0.8,
-    "research-vessel-29m": 0.8, "workboat-12m": 0.8, "azimuth-ferry-18m": 0.8,
-}  # fmt: skip
 STEPS = random_steps(hold=(0.5, 2.0))
 ZIGZAGS = in_turn(
     (zigzag(20, 20), 15), (zigzag(-20, 20, ahead=0.6), 15), (zigzag(10, 10), 10),
@@ -88,7 +85,7 @@ def sail(folder: Path, name: str, arm: str, seed: int) -> Path:
     if log.exists():
         return log
     preset = presets()[name]
-    every = max(1, round(EVERY[name] / preset.dt))
+    every = max(1, round(SAMPLE_TIMES[name] / preset.dt))
     number = 100 * seed + sorted([*MANOEUVRES, "plan"]).index(arm)
     duration = lasting(name, arm)
     if arm != "plan":

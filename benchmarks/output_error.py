@@ -19,8 +19,8 @@ Times are medians of `--repeats` runs after a first one, whose time with compila
 stands beside them.
 
     pip install ".[bench-output-error]"
-    python benchmarks/output_error.py [--samples 5000] [--repeats 3]
-    python benchmarks/output_error.py --held-out-only [--logs esso_osaka ...]
+    python -m benchmarks.output_error [--samples 5000] [--repeats 3]
+    python -m benchmarks.output_error --held-out-only [--logs esso_osaka ...]
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -45,6 +46,8 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 import greybox as gb
+from benchmarks.held_out import DATA, SHIPS
+from benchmarks.held_out_logs import AZIMUTHS
 from greybox.errors import GreyboxError
 from greybox.estimation.free_run import fit_free_runs
 from greybox.estimation.informative import regime_of
@@ -71,7 +74,6 @@ from greybox.vessel.force import force_inputs
 Array = NDArray[np.float64]
 
 OPTIONS = OutputErrorOptions(heading="input")
-DATA = Path(os.environ.get("GREYBOX_DATA", "../shared/data"))
 # what a diverged run counts, in noise deviations
 _ESCAPED = 1e6
 
@@ -387,47 +389,22 @@ class Trials:
     sample_time: float
 
 
+def _of(ship: str, sample_time: float) -> Trials:
+    there = SHIPS[ship]
+    return Trials(tomllib.loads(there.vessel), there.pattern, sample_time)
+
+
 _TRIALS = {
-    "esso_osaka": Trials(
-        {
-            "name": "3 m tanker model", "length": 3.0, "mass": 244.6,
-            "thruster": [
-                {"type": "propeller_rudder", "x": -1.5, "speed": "n_prop [rps]",
-                 "rudder": "delta_rudder [rad]"}
-            ],
-        },
-        "*.csv",
-        1.0,
-    ),
-    "kvlcc2": Trials(
-        {
-            "name": "7 m tanker model", "length": 7.0,
-            "thruster": [
-                {"type": "propeller_rudder", "x": -3.5, "speed": "n_rps", "rudder": "delta_deg"}
-            ],
-            "columns": {"delta_deg": {"name": "delta_deg", "unit": "deg"}},
-        },
-        "hsva*.csv",
-        0.5,
-    ),
-    "blueboat": Trials(
-        {
-            "name": "1.2 m catamaran", "length": 1.2, "mass": 15.0,
-            "thruster": [
-                {"type": "fixed", "y": y, "speed": f"{side}_force"}
-                for side, y in (("left", -0.285), ("right", 0.285))
-            ],
-        },
-        "*.csv",
-        0.2,
-    ),
+    "esso_osaka": _of("esso", 1.0),
+    "kvlcc2": _of("hsva", 0.5),
+    "blueboat": _of("blueboat", 0.2),
     "milliampere1": Trials(
         {
             "name": "5 m ferry", "length": 5.0,
             "thruster": [
                 {"type": "azimuth", "x": x, "y": y, "speed": f"rpm{i}", "angle": f"az{i}_deg",
                  "thrust": [[-948, -330], [-480, -80], [0, 0], [478, 135], [913, 425]]}
-                for i, x, y in ((1, 1.8, -0.8), (2, 1.8, 0.8), (3, -1.8, 0.8), (4, -1.8, -0.8))
+                for i, (x, y) in enumerate(AZIMUTHS, 1)
             ],
             "columns": {f"az{i}_deg": {"name": f"az{i}_deg", "unit": "deg"} for i in (1, 2, 3, 4)},
         },

@@ -15,7 +15,7 @@ from greybox.model.run.simulation import simulate
 from greybox.numerics.parallel import map_pieces
 from greybox.study.inputs import offset_gaussian
 from greybox.study.monte_carlo import Batch, BatchRegression
-from greybox.study.tables import Row, normalised, published, summarise
+from greybox.study.tables import Row, normalised, published
 
 Array = NDArray[np.float64]
 
@@ -65,20 +65,8 @@ class Chapter4:
         for (figures, estimator), errors in self.errors.items():
             there = reference[figures, estimator]
             for j, name in enumerate("nf"):
-                mean, sd, count = summarise(errors[:, j])
-                rows.append(
-                    Row(
-                        figures,
-                        figures,
-                        estimator,
-                        name,
-                        mean,
-                        sd,
-                        float(there[f"{name}_mean"]),
-                        float(there[f"{name}_sd"]),
-                        count,
-                    )
-                )
+                known = there[f"{name}_mean"], there[f"{name}_sd"]
+                rows.append(Row.of(figures, figures, estimator, name, errors[:, j], known))
         return rows
 
 

@@ -31,7 +31,7 @@ from greybox.numerics.parallel import map_pieces
 from greybox.rotation import ned_to_body
 from greybox.study.inputs import smooth, zig_zag
 from greybox.study.monte_carlo import Batch, BatchEstimate, BatchRegression
-from greybox.study.tables import Row, normalised, published, summarise
+from greybox.study.tables import Row, normalised, published
 from greybox.validation.fit import fit_percent
 from greybox.vessel.force import generalised_force
 from greybox.vessel.toml import load_vessel
@@ -100,28 +100,18 @@ class Chapter6:
     def rows(self) -> list[Row]:
         """Return Tables 6.2-6.7."""
         reference = {
-            (float(r["wind"]), r["estimator"], r["parameter"]): r for r in published("chapter6")
+            (float(r["wind"]), r["estimator"], r["parameter"]): (r["mean"], r["sd"])
+            for r in published("chapter6")
         }
         rows = []
         for (wind, estimator), theta in self.theta.items():
             for j, label in enumerate(self.names[estimator[-1]]):
                 true = sum(TRUE[n] for n in label.split("+"))
                 scale = 1 + true if label in ("Xu", "Yv", "Nr") else None
-                mean, sd, count = summarise(normalised(theta[:, j], true, scale))
+                errors = normalised(theta[:, j], true, scale)
                 there = reference.get((float(wind), estimator, label))
-                rows.append(
-                    Row(
-                        TABLES[wind, estimator],
-                        f"{wind} m/s",
-                        estimator,
-                        label,
-                        mean,
-                        sd,
-                        float(there["mean"]) if there else None,
-                        float(there["sd"]) if there else None,
-                        count,
-                    )
-                )
+                table = TABLES[wind, estimator]
+                rows.append(Row.of(table, f"{wind} m/s", estimator, label, errors, there))
         return sorted(rows, key=lambda r: (r.table, r.estimator != f"LS{r.estimator[-1]}"))
 
 

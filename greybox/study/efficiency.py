@@ -31,7 +31,7 @@ from greybox.numerics.parallel import map_pieces
 from greybox.rotation import ned_to_body
 from greybox.selection.fit_single import estimate_iv
 from greybox.study.chapter6 import TRUE, pulse_commands
-from greybox.study.tables import Row, summarise
+from greybox.study.tables import Row
 from greybox.trial.log import TrialLog, make_log
 from greybox.vessel.toml import load_vessel
 
@@ -150,14 +150,10 @@ class Efficiency:
             scale = np.sqrt(np.diag(result.cramer_rao))
             for estimator in result.case.estimators:
                 errors = result.errors(estimator) / scale
-                for i, name in enumerate(result.names):
-                    mean, sd, count = summarise(errors[:, i])
-                    out.append(
-                        Row(
-                            "efficiency", result.case.name, estimator, name, mean, sd, None, None,
-                            count,
-                        )
-                    )  # fmt: skip
+                out += [
+                    Row.of("efficiency", result.case.name, estimator, name, errors[:, i])
+                    for i, name in enumerate(result.names)
+                ]
         return out
 
 

@@ -40,6 +40,18 @@ class Row:
     published_sd: float | None
     runs: int
 
+    @classmethod
+    def of(
+        cls, table: str, of: str, estimator: str, parameter: str, errors: Array,
+        there: tuple[str, str] | None = None,
+    ) -> Row:  # fmt: skip
+        """Return the row of some runs' errors (R,), beside the published mean and deviation."""
+        mean, sd, count = summarise(errors)
+        if there is None:
+            return cls(table, of, estimator, parameter, mean, sd, None, None, count)
+        known_mean, known_sd = map(float, there)
+        return cls(table, of, estimator, parameter, mean, sd, known_mean, known_sd, count)
+
 
 def normalised(estimates: Array, true: float, reference: float | None = None) -> Array:
     """Return (estimate − true) / |reference|, the reference being the true value by default.
