@@ -82,7 +82,7 @@ def run_figure(run: Runs, points: int = _POINTS) -> Figure:
             ax.tick_params(labelsize=8, labelbottom=ax is below and i == len(states) - 1)
         if i == 0:
             _legend(figure, top)
-    below.set_xlabel("time [s]", fontsize=9)
+    below.set_xlabel("time from the first sample [s]", fontsize=9)
     return figure
 
 

@@ -120,7 +120,8 @@ def headline(estimate: Estimate) -> str:
         f"{_NAMES.get(s, s)} {v:.0f} %" if v > -1000 else f"{_NAMES.get(s, s)} diverged"
         for s, v in estimate.fit.items()
     )
-    return f"{told}. Its free run fits the logs it was estimated on by {fit} (100 is perfect)."
+    logs = "log" if len(estimate.logs) == 1 else "logs"
+    return f"{told}. Its free run fits the {logs} it was estimated on by {fit} (100 is perfect)."
 
 
 def _prediction(estimate: Estimate) -> list[Table]:
@@ -186,14 +187,14 @@ def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> tuple[Picture, Section
                 chart=chart_of(zoomed),
             )
         )
-    sentences = [
-        "These are the logs that the model was fitted to, so this shows what it cannot follow, "
-        "not how well it predicts: for that, see the table above."
-    ]
+    several = len(logs) > 1
+    told = f"The model was fitted to {'these logs' if several else 'this log'}, so the free run "
+    told += "shows what it cannot follow, not how well it predicts"
+    sentences = [f"{told}: for that, see the table above." if estimate.prediction else f"{told}."]
     if len(logs) > len(drawn):
         sentences.append(f"Of {len(logs)} logs the first {len(drawn)} are drawn.")
-    first = "the one of lowest fit" if len(drawn) > 1 else "it"
-    sentences.append(f"At the top of the page stands {first}.")
+    first = "Of those drawn the one of lowest fit stands" if several else "It is drawn"
+    sentences.append(f"{first} at the top of the page.")
     lead = pictures.pop(worst)
     return lead, Section("1. Does its free run follow the log?", sentences, pictures)
 

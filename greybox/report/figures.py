@@ -158,7 +158,7 @@ def comparison_figure(
         top.tick_params(labelbottom=False)
         below.tick_params(labelbottom=i == len(states) - 1)
         if i == len(states) - 1:
-            below.set_xlabel("time [s]", fontsize=9)
+            below.set_xlabel("time from the first sample [s]", fontsize=9)
     figure.align_ylabels()
     figure.suptitle(f"Free run on {shorten(log.name, 50)}", fontsize=10)
     return figure

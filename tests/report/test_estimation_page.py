@@ -109,6 +109,24 @@ def test_the_verdicts_stand_first(estimate, page, verdict, first):
     assert [row[0] for row in page.tables[0].rows] == ["surge", "sway", "yaw rate"]
 
 
+def test_the_free_run_is_told_of_as_many_logs_as_there_are(estimate, log, page):
+    one = page.sections[0].sentences
+    assert one[0].startswith("The model was fitted to this log, ")
+    assert one[0].endswith("see the table above.")
+    assert one[-1] == "It is drawn at the top of the page."
+    assert "fits the log it was estimated on" in page.headline
+    # without a table there is none to see
+    data = replace(estimate.data, logs=4 * estimate.data.logs)
+    four = replace(estimate, data=data, prediction=None, tests=())
+    told = estimation_page(four, 4 * [log.window(0, 60)], {})
+    assert "see the table above" not in told.sections[0].sentences[0]
+    assert told.sections[0].sentences[1:] == [
+        "Of 4 logs the first 3 are drawn.",
+        "Of those drawn the one of lowest fit stands at the top of the page.",
+    ]
+    assert "fits the logs it was estimated on" in told.headline
+
+
 def test_without_tests_the_page_stands(estimate, log):
     bare = estimation_page(replace(estimate, tests=(), notes=(), limits={}), [log], {})
     shown = render(bare)

@@ -59,7 +59,7 @@ def test_comparison_figure_has_labels_and_units(clean_log, thesis, true_theta):
     figure = comparison_figure(["m"], [run_model(model, clean_log)])
     labels = [a.get_ylabel() for a in figure.axes]
     assert "surge u [m/s]" in labels
-    assert figure.axes[-1].get_xlabel() == "time [s]"
+    assert figure.axes[-1].get_xlabel() == "time from the first sample [s]"
 
 
 @needs_browser
