@@ -21,7 +21,7 @@ from greybox.prediction.result import (
 )
 from greybox.report.figures import BLACK, BLUE, VERMILION, new_figure, tidy, to_svg
 from greybox.report.next_steps import after_prediction
-from greybox.report.page import Page, Picture, Section, Table, flatten
+from greybox.report.page import Page, Picture, Section, Table, computed
 from greybox.trial.manoeuvres import Compliance
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any], vessel: s
         ],
         lead=replace(lead, caption=f"{sections[0].title}: {lead.caption}"),
         next_steps=after_prediction(made, record, vessel),
-        computed=flatten(record),
+        computed=computed(record),
     )  # fmt: skip
 
 
@@ -123,7 +123,14 @@ def _capital(text: str) -> str:
 
 
 def _values(made: PredictedManoeuvre) -> Table:
-    rows = []
+    angles = made.log.vessel.angle_commands
+    rows = [
+        [
+            f"{name} of the approach",
+            *_cells(value.scaled(1.0, "rad" if name in angles else "1"), made.length), "", "",
+        ]
+        for name, value in made.commands.items()
+    ]  # fmt: skip
     for name, value in made.quantities.items():
         criterion = made.criterion(name)
         limit = verdict = ""
@@ -147,7 +154,8 @@ def _cells(value: MonteCarloQuantity | None, length: float) -> list[str]:
         return ["not reached", "", ""]
     plain, interval = value.words()
     lengths = f"{value.value / length:.2f} L" if value.unit == "m" else ""
-    return [plain, lengths, interval]
+    # what was ordered is the same in every draw
+    return [plain, lengths, interval if value.low < value.high else ""]
 
 
 def _beside(made: PredictedManoeuvre) -> Table:
@@ -173,7 +181,7 @@ def _pictures(made: PredictedManoeuvre, key: str) -> list[Picture]:
         return [Picture(to_svg(_histories(made, panels, 10, 4.2), key), note)]
     panels = [
         ("heading", "heading [deg]", _DEGREES),
-        ("r", "yaw [deg/s]", _DEGREES),
+        ("r", "yaw rate [deg/s]", _DEGREES),
         ("speed", "speed [m/s]", 1.0),
     ]
     if "steering" in made.bundle.nominal:

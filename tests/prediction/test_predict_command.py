@@ -49,6 +49,11 @@ def test_a_turn_is_predicted_written_and_shown(model, tmp_path, capsys):
     assert html.count("<svg") == 4
     assert "Limits of IMO MSC.137(76): 4 of 4 met." in html
     assert "<script" not in html
+    # what the approach was sailed with, as the terminal tells it, and how it was computed
+    assert "approach with n = " in shown
+    assert html.count(">n of the approach</td>") == 2
+    assert ">computed with</td>" in html
+    assert "versions numpy" not in html
     logs = sorted(tmp_path.glob("t_*.csv"))
     assert [p.name for p in logs] == ["t_port_35.csv", "t_starboard_35.csv"]
     log = read_log(logs[0], load_model(model).vessel)
