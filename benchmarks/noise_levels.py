@@ -1,17 +1,11 @@
-"""Noise levels of an estimate by exact slopes, and by SciPy's finite differences of the same loss.
+"""Noise levels by exact slopes, and by SciPy's finite differences: a row of `python -m benchmarks`.
 
-Both maximise the same likelihood of the same equation errors by the same L-BFGS-B, from the
-same start, in the same run of this script; what differs is where the slopes come from. The
-process noise has a memory, and the sensors are sought too: nine levels. Prints seconds a fit,
-their ratio, and the loss where each ends.
-
-    python benchmarks/noise_levels.py [--samples 2000 20000] [--repeats 3]
+Both maximise the same likelihood of the same equation errors by the same L-BFGS-B, from the same
+start; what differs is where the slopes come from. The process noise has a memory, and the sensors
+are sought too: nine levels.
 """
 
 from __future__ import annotations
-
-import argparse
-import time
 
 import numpy as np
 from scipy.optimize import minimize
@@ -66,31 +60,3 @@ def fit(likelihood, exact):
                         options=options)  # fmt: skip
     return minimize(lambda p: likelihood.loss(noise_of(p / unit)), start * unit, method="L-BFGS-B",
                     bounds=bounds, options={**options, "eps": 1e-4 * unit})  # fmt: skip
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--samples", type=int, nargs="+", default=[2000, 20_000])
-    parser.add_argument("--repeats", type=int, default=3)
-    options = parser.parse_args()
-    for samples in options.samples:
-        likelihood = draw(samples)
-        shortest, found = {}, {}
-        for exact in (True, False):
-            seconds = []
-            for _ in range(options.repeats):
-                start = time.process_time()
-                found[exact] = fit(likelihood, exact)
-                seconds.append(time.process_time() - start)
-            shortest[exact] = min(seconds)
-        print(f"{samples} samples, shortest of {options.repeats}, processor time")
-        for exact, name in ((True, "exact slopes"), (False, "SciPy's differences")):
-            f = found[exact]
-            print(
-                f"  {name:<22}{shortest[exact]:8.3f} s   {f.nit:3d} steps   loss {f.fun:.4f}   "
-                f"ratio {shortest[exact] / shortest[True]:5.2f}"
-            )
-
-
-if __name__ == "__main__":
-    main()

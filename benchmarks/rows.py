@@ -412,6 +412,26 @@ def diagnosis(samples: int) -> Iterator[Row]:
     yield from compare("diagnosis", samples, "samples", here, {name: (there, "")}, same)
 
 
+def noise_levels(samples: int) -> Iterator[Row]:
+    """Nine levels of sensors and of process noise with a memory, by exact slopes and without."""
+    from benchmarks.noise_levels import draw, fit
+
+    likelihood, name = draw(samples), "SciPy's finite differences"
+    found: dict[str, Any] = {}
+
+    def here() -> None:
+        found["here"] = fit(likelihood, exact=True)
+
+    def there() -> None:
+        found[name] = fit(likelihood, exact=False)
+
+    def ends(_: str) -> str:
+        mine, its = found["here"], found[name]
+        return f"loss here {mine.fun:.4f} in {mine.nit} steps, it {its.fun:.4f} in {its.nit}"
+
+    yield from compare("noise-levels", samples, "samples", here, {name: (there, "")}, ends)
+
+
 def raw_import(megabytes: int) -> Iterator[Row]:
     """`greybox import` in a process of its own, with all checks, against what only reads.
 
@@ -469,5 +489,6 @@ ROWS = {
     "monte-carlo": Rows(monte_carlo, (16, 64), (256,)),
     "design": Rows(design, (25, 50), (100, 200)),
     "diagnosis": Rows(diagnosis, (300, 600), (1200,)),
+    "noise-levels": Rows(noise_levels, (2000,), (20_000,)),
     "import": Rows(raw_import, (2, 8), (50,)),
 }
