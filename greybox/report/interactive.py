@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 _SCALE = 88
 _LEAST, _MOST = 110, 420
 _LEGEND_ROW = 24
+# share of a signal's range that single precision may lose: coordinates of a grid need double
+_LOST = 1e-6
 _AXIS = 34
 # how a figure says that its seconds are written as minutes
 _MINUTES = "[min:s]"
@@ -110,11 +112,16 @@ def _encoded(value: Any, names: dict[_Model, str], prefix: str) -> Any:
         properties = {k: _encoded(v, names, prefix) for k, v in value.properties.items()}
         return head | ({"attributes": properties} if properties else {})
     if isinstance(value, np.ndarray):
-        packed = gzip.compress(value.astype("<f4").tobytes(), compresslevel=2, mtime=0)
+        kept = value.astype("<f4")
+        known = value[np.isfinite(value)]
+        lost = np.abs(known - kept[np.isfinite(value)]).max(initial=0.0)
+        if lost > _LOST * (np.ptp(known) if known.size else 0.0):
+            kept = value.astype("<f8")
+        packed = gzip.compress(kept.tobytes(), compresslevel=2, mtime=0)
         data = b64encode(packed).decode()
         return {
             "type": "ndarray", "array": {"type": "bytes", "data": data},
-            "shape": list(value.shape), "dtype": "float32", "order": "little",
+            "shape": list(value.shape), "dtype": kept.dtype.name, "order": "little",
         }  # fmt: skip
     if isinstance(value, dict):
         return {k: _encoded(v, names, prefix) for k, v in value.items()}

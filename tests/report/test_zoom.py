@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
 import re
 import time
@@ -48,6 +50,27 @@ def zoomable():
     figure = stacked()
     picture = Picture(to_svg(figure, "stacked"), HOSTILE, SENTENCE, chart=chart_of(figure))
     return Page(HOSTILE, HOSTILE, [HOSTILE], [picture], computed={HOSTILE: HOSTILE})
+
+
+def arrays_of(item):
+    """Every packed array of a chart's JSON, by its type of number."""
+    if isinstance(item, dict):
+        if item.get("type") == "ndarray":
+            raw = gzip.decompress(base64.b64decode(item["array"]["data"]))
+            yield item["dtype"], np.frombuffer(raw, item["dtype"])
+        item = list(item.values())
+    for part in item if isinstance(item, list) else ():
+        yield from arrays_of(part)
+
+
+def test_far_coordinates_keep_their_steps():
+    figure = new_figure(4, 4)
+    way = 0.1 * np.arange(50.0)
+    figure.subplots().plot(598765 + way, np.r_[6512345 + way[:-1], np.nan])
+    figure.axes[0].plot(np.full(3, 0.1), [0.0, np.nan, 1500.2])
+    found = list(arrays_of(json.loads(chart_json(chart_of(figure), "zoom0"))))
+    assert [kind for kind, _ in found] == ["float64", "float64", "float64", "float32"]
+    assert np.diff(found[1][1][:-1]) == pytest.approx(0.1, abs=1e-6)
 
 
 def test_a_chart_holds_what_the_figure_shows():
