@@ -23,6 +23,7 @@ from greybox.numerics.linalg import scaled_inverse
 
 Array = NDArray[np.float64]
 
+_LEVEL = 0.95
 # a set this many times as wide as the ordinary interval contradicts it
 _WIDER = 1.5
 # share of a standard error by which the instruments of an iteration's end may move an estimate
@@ -93,15 +94,12 @@ def solve_quadratic(estimate: float, v00: float, v01: float, v11: float, c: floa
     return ConfidenceSet(((-np.inf, ends[0]), (ends[1], np.inf)))
 
 
-def confidence_sets(
-    equation: Equation, level: float = 0.95, std: Array | None = None
-) -> list[ConfidenceSet]:
-    """Return the set of each parameter of an equation, robust to the moving average.
+def confidence_sets(equation: Equation, std: Array | None = None) -> list[ConfidenceSet]:
+    """Return the 95 % set of each parameter of an equation, robust to the moving average.
 
     Parameters
     ----------
     equation : Equation
-    level : float
     std : ndarray, optional
         (p,) standard errors of its estimate that allow for more than the noise model, and by
         as much the sets do.
@@ -135,7 +133,7 @@ def confidence_sets(
     v00 = lost * sum(((w * e) ** 2).sum(axis=1) for w, e in zip(weights, errors, strict=True))
     v01, v11 = _of_shift(equation.keep, weights, errors, shift, lost)
     v11 = np.maximum(v11, v01**2 / np.where(v00 > 0, v00, np.inf))
-    c = fdtri(1, known, level)
+    c = fdtri(1, known, _LEVEL)
     if std is not None:
         c = c * np.maximum(std**2 / np.where(v00 > 0, v00, np.inf), 1.0)
     return [
@@ -144,10 +142,8 @@ def confidence_sets(
     ]
 
 
-def refined_confidence_sets(
-    white: WhiteEquations, theta: Array, std: Array, level: float = 0.95
-) -> list[ConfidenceSet]:
-    """Return the set of each parameter of a refined estimate, all equations together.
+def refined_confidence_sets(white: WhiteEquations, theta: Array, std: Array) -> list[ConfidenceSet]:
+    """Return the 95 % set of each parameter of a refined estimate, all equations together.
 
     Where instruments are strong it is the interval of `std`.
 
@@ -156,7 +152,6 @@ def refined_confidence_sets(
     white : WhiteEquations
     theta, std : ndarray
         (p,) the refined estimate and its standard errors.
-    level : float
     """
     from scipy.special import chdtri
 
@@ -172,7 +167,7 @@ def refined_confidence_sets(
         v01, v11 = v01 + both, v11 + own
     v00 = std**2
     v11 = np.maximum(v11, v01**2 / np.where(v00 > 0, v00, np.inf))
-    c = float(chdtri(1, 1 - level))
+    c = float(chdtri(1, 1 - _LEVEL))
     return [
         solve_quadratic(float(t), float(a), float(b), float(d), c)
         for t, a, b, d in zip(theta, v00, v01, v11, strict=True)

@@ -40,7 +40,7 @@ def endogeneity(equation: Equation, *, decisive: bool = True) -> TestResult:
     """
 
     def score() -> ScoreStatistic:
-        errors = _residuals(equation, _least_squares(equation))
+        errors = equation.residuals_of(_least_squares(equation))
         zhat = equation.solution.projected
         noise = [f - z for f, z in zip(equation.phi, zhat, strict=True)]
         after = noise_after_error(noise, errors)
@@ -68,7 +68,3 @@ def _least_squares(equation: Equation) -> Array:
     gram = np.asarray(sum(f @ f.T for f in equation.phi))
     right = np.asarray(sum(f @ y for f, y in zip(equation.phi, equation.y, strict=True)))
     return np.asarray(scaled_inverse(gram) @ right)
-
-
-def _residuals(equation: Equation, theta: Array) -> list[Array]:
-    return [y - theta @ f for y, f in zip(equation.y, equation.phi, strict=True)]

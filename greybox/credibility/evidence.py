@@ -102,17 +102,19 @@ class Equation:
         ends = np.cumsum([len(y) for y in self.y])[:-1]
         return replace(found, projected=tuple(np.split(found.projected[0], ends, axis=1)))
 
-    @cached_property
-    def pooled_residuals(self) -> tuple[Array, ...]:
-        """Residuals of that estimate, (N,) an experiment."""
-        theta = self.pooled.theta
+    def residuals_of(self, theta: Array) -> tuple[Array, ...]:
+        """Return the residuals of coefficients (p,), (N,) an experiment."""
         return tuple(y - theta @ f for y, f in zip(self.y, self.phi, strict=True))
 
     @cached_property
+    def pooled_residuals(self) -> tuple[Array, ...]:
+        """Residuals of that estimate."""
+        return self.residuals_of(self.pooled.theta)
+
+    @cached_property
     def residuals(self) -> tuple[Array, ...]:
-        """Residuals of the plain instrumental-variable estimate, (N,) an experiment."""
-        theta = self.solution.theta
-        return tuple(y - theta @ f for y, f in zip(self.y, self.phi, strict=True))
+        """Residuals of the plain instrumental-variable estimate."""
+        return self.residuals_of(self.solution.theta)
 
     @cached_property
     def noise_model(self) -> ARMANoise:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.credibility.evidence import Equation
+from greybox.credibility.weak import orthonormal
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.numerics.lagged_moments import lagged_products
 from greybox.numerics.linalg import scaled_inverse
@@ -45,11 +46,9 @@ def surplus_bias(equation: Equation) -> Array:
     for z, f, hat, e in zip(
         equation.z, equation.phi, equation.solution.projected, equation.residuals, strict=True
     ):
-        size = np.linalg.norm(z, axis=1)
-        if not (size > 0).any():
+        basis = orthonormal(z)
+        if not len(basis):
             continue
-        _, values, vt = np.linalg.svd(z[size > 0] / size[size > 0, None], full_matrices=False)
-        basis = vt[values > 1e-12 * values[0]]
         q += len(basis)
         for k in range(-_REACH, _REACH + 1):
             noise = [f - hat]

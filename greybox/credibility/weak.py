@@ -81,7 +81,7 @@ def measure_strength(equation: Equation) -> Strength:
     solution = equation.solution
     explained = solution.projected
     noise = [f - h for f, h in zip(equation.phi, explained, strict=True)]
-    bases = [_orthonormal(z) for z in equation.z]
+    bases = [orthonormal(z) for z in equation.z]
     q = sum(len(b) for b in bases)
     p = len(equation.labels)
     freedom = max(equation.freedom - q, 1)
@@ -107,7 +107,8 @@ def measure_strength(equation: Equation) -> Strength:
     )
 
 
-def _orthonormal(z: Array) -> Array:
+def orthonormal(z: Array) -> Array:
+    """Return rows that span those of z (q, N) and are orthonormal."""
     size = np.linalg.norm(z, axis=1)
     if not (size > 0).any():
         return np.zeros((0, z.shape[1]))
