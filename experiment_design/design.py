@@ -63,6 +63,7 @@ _NEAR, _POLISH, _PATIENCE = 0.1, 40, 3600.0
 _log = logging.getLogger(__name__)
 
 
+@one_thread()
 def design_trial(
     request: PreparedRequest,
     *,
@@ -106,18 +107,6 @@ def design_trial(
     Ljungberg (2020), A10, A15 and section 5.2 for the margins; Atkinson, Donev and
     Tobias (2007) for the criteria.
     """
-    with one_thread():
-        return _design(request, best_effort, progress, workers, first, alternatives)
-
-
-def _design(
-    request: PreparedRequest,
-    best_effort: bool,
-    progress: Progress | None,
-    workers: int | None,
-    first: tuple[Array, ...] | None,
-    alternatives: bool,
-) -> Design:
     began = time.perf_counter()
     require_horizon(request)
     request = after_lead_in(request)

@@ -213,6 +213,38 @@ def prior_misfit(model: ManoeuvringModel) -> tuple[Array, str]:
     return np.array(shares), str(prediction.get("level", ""))
 
 
+def operating_envelope(
+    request: PreparedRequest, model: ManoeuvringModel, given: Mapping[str, tuple[float, float]]
+) -> tuple[Envelope, str]:
+    """Return how the ship is used, and the verdict on the prior's predictions.
+
+    Parameters
+    ----------
+    request : PreparedRequest
+    model : ManoeuvringModel
+        The prior, with what its own trial showed.
+    given : mapping of str to (float, float)
+        See `command_ranges`.
+    """
+    misfit, level = prior_misfit(model)
+    shown = model.record.get("ranges")
+    speeds = None
+    if isinstance(shown, Mapping) and "u" in shown:
+        speeds = (float(shown["u"][0]), float(shown["u"][1]))
+    named = request.structure.estimable()
+    predictor = replace(
+        build_predictor(named, "basic", tuple((s, (1, -1)) for s in request.structure.states)),
+        structure=request.structure,
+    )
+    rollout = build_problem(request).scenarios[0].rollout
+    found = build_envelope(
+        rollout, predictor, request.noise, request.schedule, command_ranges(model, given), speeds,
+        misfit, request.seed,
+    )  # fmt: skip
+    return found, level
+
+
+@one_thread()
 def design_for_prediction(
     request: PreparedRequest,
     model: ManoeuvringModel,
@@ -255,53 +287,10 @@ def design_for_prediction(
     ----------
     Box and Draper (1959); DuMouchel and Jones (1994).
     """
-    with one_thread():
-        return _design(request, model, envelope or {}, kept_starts, sailed, workers)
-
-
-def operating_envelope(
-    request: PreparedRequest, model: ManoeuvringModel, given: Mapping[str, tuple[float, float]]
-) -> tuple[Envelope, str]:
-    """Return how the ship is used, and the verdict on the prior's predictions.
-
-    Parameters
-    ----------
-    request : PreparedRequest
-    model : ManoeuvringModel
-        The prior, with what its own trial showed.
-    given : mapping of str to (float, float)
-        See `command_ranges`.
-    """
-    misfit, level = prior_misfit(model)
-    shown = model.record.get("ranges")
-    speeds = None
-    if isinstance(shown, Mapping) and "u" in shown:
-        speeds = (float(shown["u"][0]), float(shown["u"][1]))
-    named = request.structure.estimable()
-    predictor = replace(
-        build_predictor(named, "basic", tuple((s, (1, -1)) for s in request.structure.states)),
-        structure=request.structure,
-    )
-    rollout = build_problem(request).scenarios[0].rollout
-    found = build_envelope(
-        rollout, predictor, request.noise, request.schedule, command_ranges(model, given), speeds,
-        misfit, request.seed,
-    )  # fmt: skip
-    return found, level
-
-
-def _design(
-    request: PreparedRequest,
-    model: ManoeuvringModel,
-    given: Mapping[str, tuple[float, float]],
-    kept_starts: int,
-    sailed: Sequence[Motion],
-    workers: int | None,
-) -> PredictionDesign:
     began = time.perf_counter()
     require_compatible(request.given | {"for prediction"})
     require_horizon(request)
-    found, level = operating_envelope(request, model, given)
+    found, level = operating_envelope(request, model, envelope or {})
     states = request.structure.states
     asked = replace(started_in(request, found, kept_starts), misfit=found.misled)
     if kept_starts:

@@ -65,7 +65,6 @@ def run_demo(
     seed: int = 0,
     tell: Tell = lambda step: None,
     progress: Callable[[str], None] = lambda text: None,
-    workers: int | None = None,
 ) -> Demo:
     """Go once round the loop on a virtual ship, and leave each step's file in a folder.
 
@@ -80,8 +79,6 @@ def run_demo(
         Called with each step when it is done.
     progress : callable
         Called with what is being done.
-    workers : int, optional
-        Processes of the designs.
 
     Raises
     ------
@@ -105,10 +102,7 @@ def run_demo(
     prior = prior_model()
     prior.save(files.prior)
     progress("designing the first trial")
-    design = design_trial(
-        prepare_request(prior, _asked(_SECONDS, seed)),
-        alternatives=False, workers=workers,
-    )  # fmt: skip
+    design = design_trial(prepare_request(prior, _asked(_SECONDS, seed)), alternatives=False)
     write_plan(design, files.plan)
     done(_designed(design))
 
@@ -145,7 +139,7 @@ def run_demo(
 
     progress("designing the next trial")
     asked = _asked(_NEXT_SECONDS, seed, prior=better)
-    next_design = design_trial(prepare_request(better, asked), alternatives=False, workers=workers)
+    next_design = design_trial(prepare_request(better, asked), alternatives=False)
     write_plan(next_design, files.next_plan)
     done(_designed_next(next_design, better))
     return Demo(

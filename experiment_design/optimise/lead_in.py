@@ -42,11 +42,11 @@ _KEPT_ON = 3
 _RELAXED, _SHARES = (1.1, 1.5, 2.0, 3.0, 5.0), (0.95, 0.9, 0.8, 0.65, 0.4, 0.2)
 
 
-def short_of_margin(request: PreparedRequest, trial: int = 0) -> bool:
-    """Whether a trial's start misses margins and nothing else."""
-    program = build_problem(replace(request, backoff=()), trial).scenarios[0].limits
+def short_of_margin(request: PreparedRequest) -> bool:
+    """Whether the first trial's start misses margins and nothing else."""
+    program = build_problem(replace(request, backoff=())).scenarios[0].limits
     start = np.zeros(program.nx + 3)
-    start[: program.nx + 1] = request.starts[trial]
+    start[: program.nx + 1] = request.starts[0]
     missed = program.path_values(start[None])[:, 0] > TOLERANCE
     margins = program.of_regime
     return bool((missed & margins).any() and not (missed & ~margins).any())

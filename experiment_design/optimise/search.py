@@ -81,11 +81,11 @@ def limit_scale(problem: TrialProblem) -> Array:
     return problem.scenarios[0].limits.scale
 
 
-def assess(problem: TrialProblem, unit: Array, evaluations: int = 0) -> list[Candidate]:
+def assess(problem: TrialProblem, unit: Array) -> list[Candidate]:
     """Return candidates of sequences (R, K, nc)."""
     result = problem.evaluate(unit)
     return [
-        Candidate(u, float(v), result.missed[:, i], evaluations)
+        Candidate(u, float(v), result.missed[:, i])
         for i, (u, v) in enumerate(zip(unit, result.value, strict=True))
     ]
 

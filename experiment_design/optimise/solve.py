@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
@@ -26,6 +25,8 @@ Array = NDArray[np.float64]
 EXACT_COLUMNS = 20
 # most unknowns for which sensitivities are states of the program
 SENSITIVE_COLUMNS = 8
+# of IPOPT, in scaled variables
+_TOLERANCE = 1e-6
 # share of its range within which a level counts as at a limit
 _NEAR = 1e-3
 
@@ -69,18 +70,11 @@ class Polished(Candidate):
         What happened, one sentence or two.
     iterations : int
         Of IPOPT.
-    seconds : float
-        Building and solving.
     """
 
     outcome: Outcome = Outcome.REFUSED
     status: str = ""
     iterations: int = 0
-    seconds: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not self.status:
-            object.__setattr__(self, "status", self.outcome.value)
 
 
 class _Iterates(ca.Callback):
@@ -169,13 +163,9 @@ def run_ipopt(
     *,
     iterations: int = 100,
     seconds: float = 60.0,
-    tolerance: float = 1e-6,
     barrier: float = 1e-3,
-    limited_memory: bool = False,
-    verbose: bool = False,
 ) -> Polished:
     """Run IPOPT from a sequence and return the best of its iterates; see `solve_ipopt`."""
-    began = time.perf_counter()
     start = np.clip(np.asarray(unit, float), 0.0, 1.0)
     options: dict[str, Any] = {
         "iteration_callback_ignore_errors": True,
@@ -183,11 +173,11 @@ def run_ipopt(
         "print_time": False,
         "show_eval_warnings": False,
         "ipopt.sb": "yes",
-        "ipopt.print_level": 5 if verbose else 0,
+        "ipopt.print_level": 0,
         "ipopt.max_iter": iterations,
         "ipopt.max_wall_time": seconds,
-        "ipopt.tol": tolerance,
-        "ipopt.acceptable_tol": 100 * tolerance,
+        "ipopt.tol": _TOLERANCE,
+        "ipopt.acceptable_tol": 100 * _TOLERANCE,
         "ipopt.acceptable_iter": 5,
         "ipopt.mu_init": barrier,
         "ipopt.bound_push": barrier,
@@ -196,11 +186,9 @@ def run_ipopt(
         "ipopt.slack_bound_frac": barrier,
         "ipopt.nlp_scaling_method": "none",
     }
-    if limited_memory:
-        options["ipopt.hessian_approximation"] = "limited-memory"
     key = repr(options)
     if key not in shooting.solvers:
-        shooting.solvers[key] = _solver(shooting, options, limited_memory)
+        shooting.solvers[key] = _solver(shooting, options)
     solver, watch = shooting.solvers[key]
     watch.seen.clear()
     lower, upper = shooting.bounds()
@@ -214,15 +202,12 @@ def run_ipopt(
         outcome = _STATUS.get(status, Outcome.FAILED)
     except KeyboardInterrupt:
         outcome = Outcome.INTERRUPTED
-    return _judge(shooting, start, watch.seen, outcome, status, time.perf_counter() - began)
+    return _judge(shooting, start, watch.seen, outcome, status)
 
 
-def _solver(
-    shooting: Shooting, options: dict[str, Any], limited_memory: bool
-) -> tuple[Any, _Iterates]:
+def _solver(shooting: Shooting, options: dict[str, Any]) -> tuple[Any, _Iterates]:
     watch = _Iterates(shooting.variables, shooting.rows, shooting.levels)
-    names = ["grad_f", "jac_g"] + ["hess_lag"] * (not limited_memory)
-    given = {n: shooting.functions[n] for n in names}
+    given = {n: shooting.functions[n] for n in ("grad_f", "jac_g", "hess_lag")}
     w, p, f, g = shooting.symbols
     problem: dict[str, Any] = {"x": w, "p": p, "f": f, "g": g}
     everything = options | given | {"iteration_callback": watch}
@@ -230,12 +215,7 @@ def _solver(
 
 
 def _judge(
-    shooting: Shooting,
-    start: Array,
-    seen: list[Array],
-    outcome: Outcome,
-    status: str,
-    seconds: float,
+    shooting: Shooting, start: Array, seen: list[Array], outcome: Outcome, status: str
 ) -> Polished:
     problem = shooting.problem
     sequences = [start, *[np.clip(u.reshape(problem.shape), 0.0, 1.0) for u in seen]]
@@ -256,24 +236,16 @@ def _judge(
         sentence += f" Its status: {status.replace('_', ' ').lower()}."
     if place == 0:
         sentence += " The sequence that it started from was better and was kept."
-    return Polished(
-        best.unit, best.value, best.missed, len(seen), outcome, sentence, len(seen) - 1,
-        seconds,
-    )  # fmt: skip
+    return Polished(best.unit, best.value, best.missed, len(seen), outcome, sentence, len(seen) - 1)
 
 
 def solve_ipopt(
     problem: TrialProblem,
     unit: Array,
     *,
-    exact: bool | None = None,
     iterations: int = 100,
     seconds: float = 60.0,
-    tolerance: float = 1e-6,
     barrier: float = 1e-3,
-    limited_memory: bool = False,
-    verbose: bool = False,
-    shooting: Shooting | None = None,
 ) -> Polished:
     """Polish a sequence, feasible or not, by multiple shooting with IPOPT.
 
@@ -286,23 +258,12 @@ def solve_ipopt(
     problem : TrialProblem
     unit : ndarray
         (K, nc) start, unit coordinates.
-    exact : bool, optional
-        Climb the exact criterion instead of that of white equation errors; by
-        default where the predictor has at most `EXACT_COLUMNS` columns.
     iterations : int
         Most iterations of IPOPT.
     seconds : float
         Most wall time of IPOPT [s].
-    tolerance : float
-        Of IPOPT, in scaled variables.
     barrier : float
         First barrier parameter, and how far the start is pushed from its limits.
-    limited_memory : bool
-        Approximate the Hessian by L-BFGS instead of computing it.
-    verbose : bool
-        Let IPOPT print its iterations.
-    shooting : Shooting, optional
-        The program of the same problem, to spare building it for each start.
 
     Returns
     -------
@@ -316,19 +277,9 @@ def solve_ipopt(
     start. With white R the sums of earlier trials count as if their errors had
     this trial's variance.
     """
-    began = time.perf_counter()
-    if shooting is None:
-        try:
-            shooting = make_shooting(problem, np.asarray(unit, float), exact)
-        except UsageError as refusal:
-            start = assess(problem, np.asarray(unit, float)[None])[0]
-            return Polished(
-                start.unit, start.value, start.missed, 1, Outcome.REFUSED, str(refusal), 0,
-                time.perf_counter() - began,
-            )  # fmt: skip
-    build = time.perf_counter() - began
-    found = run_ipopt(
-        shooting, unit, iterations=iterations, seconds=seconds, tolerance=tolerance,
-        barrier=barrier, limited_memory=limited_memory, verbose=verbose,
-    )  # fmt: skip
-    return replace(found, seconds=found.seconds + build)
+    try:
+        shooting = make_shooting(problem, np.asarray(unit, float))
+    except UsageError as refusal:
+        start = assess(problem, np.asarray(unit, float)[None])[0]
+        return Polished(start.unit, start.value, start.missed, 1, Outcome.REFUSED, str(refusal))
+    return run_ipopt(shooting, unit, iterations=iterations, seconds=seconds, barrier=barrier)

@@ -208,7 +208,7 @@ def test_infeasible_start_ends_within_all_limits(ship, thesis, true_theta):
     )  # fmt: skip
     unit = draw_two_level(p, np.random.default_rng(0), 1)[0]
     assert not assess(p, unit[None])[0].feasible
-    found = solve_ipopt(p, unit, exact=False, iterations=150)
+    found = run_ipopt(make_shooting(p, unit, exact=False), unit, iterations=150)
     assert found.feasible, (found.status, found.missed)
     assert found.iterations > 3
     levels = p.levels(found.unit)
