@@ -17,6 +17,7 @@ from greybox.report.thinning import find_gaps, longest, pick, thin
 from greybox.report.track import draw_track
 from greybox.trial.log import TrialLog
 from greybox.trial.wind import direction_from, true_wind
+from greybox.units import spelled_unit
 
 Array = NDArray[np.float64]
 
@@ -116,7 +117,8 @@ def _inputs(log: TrialLog, clock: _Clock) -> Iterator[_Panel]:
         if name in log.vessel.angle_commands:
             angles[name] = np.degrees(log[name])
         else:
-            speeds.setdefault(units.get(name) or "unit of the log", {})[name] = log[name]
+            unit = units.get(name) or _split_unit(name)[1] or "unit of the log"
+            speeds.setdefault(unit, {})[name] = log[name]
     controlled = _controlled(log, clock)
     for unit, lines in speeds.items():
         yield _Panel(f"propeller speed{_only(lines)}\n[{unit}]", lines, "number", controlled)
@@ -131,9 +133,16 @@ def _only(lines: Mapping[str, Array]) -> str:
     if len(lines) != 1:
         return ""
     # a unit within the column's name would stand beside the axis's own
-    name = re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", next(iter(lines)))
+    name = _split_unit(next(iter(lines)))[0]
     name = name if len(name) <= _LONG_NAME else f"{name[: _LONG_NAME - 1]}…"
     return f" {name}" if len(name) <= 5 else f"\n{name}"
+
+
+def _split_unit(name: str) -> tuple[str, str]:
+    """Return a column's name without the unit in brackets that ends it, and that unit."""
+    found = re.search(r"\s*[\[(]([^\])]*)[\])]\s*$", name)
+    unit = spelled_unit(found[1]) if found else None
+    return (name[: found.start()], unit) if found and unit else (name, "")
 
 
 def _controlled(log: TrialLog, clock: _Clock) -> list[tuple[float, float]]:

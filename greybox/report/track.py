@@ -90,6 +90,8 @@ def draw_track(axes: Any, log: TrialLog, gaps: NDArray[np.intp], points: int) ->
     axes.set_xlabel("east [m]", fontsize=9)
     axes.set_ylabel("north [m]", fontsize=9)
     axes.tick_params(labelsize=8)
+    # an offset or a power of ten would stand under the legend
+    axes.ticklabel_format(useOffset=False, style="plain")
     axes.margins(0.06)
     tidy(axes)
 

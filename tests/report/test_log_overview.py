@@ -77,6 +77,16 @@ def test_angles_are_in_degrees_and_wind_from_where_it_comes(ship):
     )
 
 
+def test_coordinates_of_a_grid_are_written_in_full(ship):
+    log = sailed(ship)
+    far = {**log.channels, "x_n": log["x_n"] + 6512345, "y_n": log["y_n"] + 598765}
+    figure = page_figures(replace(log, channels=far))["track"]
+    svg = to_svg(figure, "far")
+    assert figure.axes[0].yaxis.get_offset_text().get_text() == ""
+    assert any(t.get_text().startswith("65123") for t in figure.axes[0].get_yticklabels())
+    assert "<svg" in svg
+
+
 def test_the_map_has_north_up_and_equal_axes(ship):
     log = sailed(ship)
     figure = page_figures(log)["track"]
@@ -179,16 +189,23 @@ def test_inputs_share_axes_by_unit():
             "thruster": [
                 {"type": "propeller_rudder", "speed": "n", "rudder": "delta", "x": -2.0},
                 {"type": "tunnel", "speed": "bow", "x": 2.0},
+                {"type": "tunnel", "speed": "stern [rps]", "x": -2.0},
+                {"type": "fixed", "speed": "n (aft)"},
             ],
-            "columns": {"Shaft": {"name": "n", "unit": "rpm"}},
+            "columns": {
+                "Shaft": {"name": "n", "unit": "rpm"}, "Aft": {"name": "n (aft)", "unit": "N"}
+            },
         }
-    )
+    )  # fmt: skip
     wave = np.sin(np.arange(50.0))
-    log = make_log(vessel, {"n": wave, "bow": wave, "delta": wave, "u": wave}, 1.0)
+    inputs = dict.fromkeys(("n", "bow", "stern [rps]", "n (aft)", "delta", "u"), wave)
+    log = make_log(vessel, inputs, 1.0)
     assert [ax.get_ylabel() for ax in signals(log).axes] == [
         "velocity over\nground [m/s]",
         "propeller speed n\n[rpm]",
         "propeller speed bow\n[unit of the log]",
+        "propeller speed stern\n[rps]",
+        "propeller speed\nn (aft)\n[N]",
         "rudder angle delta\n[deg]",
     ]
 
