@@ -379,7 +379,7 @@ def _active(problem: TrialProblem, candidate: Candidate) -> bool:
     if len(problem.scenarios) > 1 or problem.criterion.prior is not None:
         return False
     program = problem.scenarios[0].limits
-    commands = problem.schedule.expand(problem.levels(candidate.unit))
+    commands = problem.commands(candidate.unit)
     motion = problem.scenarios[0].rollout.run(commands[None])
     path = program.path_values(motion.state[0]).max(axis=1, initial=-np.inf) / program.path_scale
     whole = program.whole_values(motion)[:, 0] / program.whole_scale

@@ -236,7 +236,7 @@ def _require_different(request: PreparedRequest, names: tuple[str, str]) -> None
     """Raise where two explanations move the ship alike under every drawn sequence."""
     problem = build_problem(request)
     drawn = draw_two_level(problem, np.random.default_rng([29, request.seed]), 5)
-    commands = problem.schedule.expand(problem.levels(drawn))
+    commands = problem.commands(drawn)
     assert isinstance(problem.contrast, Contrast)
     largest = float(problem.contrast.value(commands).max())
     if largest < np.log(_SAME):

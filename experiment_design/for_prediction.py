@@ -446,7 +446,7 @@ def _campaign(
             problem, envelope, request.seed + 1000 * trial, request.effort, known, workers
         )
         found.append(search)
-        commands = problem.schedule.expand(problem.levels(search.candidate.unit))
+        commands = problem.commands(search.candidate.unit)
         motion = problem.scenarios[0].rollout.run(commands[None])
         known = known + envelope.information(motion)[0]
     return found

@@ -35,7 +35,7 @@ def limited_ship(speed=None, angle=None, angles=(0.6, 1.1)):
 
 
 def make_request(structure="thesis", duration=120.0, **changes) -> PreparedRequest:
-    """The thesis's ship as issue and CONTRACT have it, with changes."""
+    """A request for the thesis's ship within narrower limits, with changes."""
     s = get_structure(structure)
     n = len(s.states)
     start = np.array([1.5, 1.2, 0.0, 0.0]) if n == 3 else np.array([1.5, 0.0])

@@ -291,7 +291,7 @@ class _Pool:
     def information(self, units: Array) -> Array:
         """Return the information of sequences (R, K, nc)."""
         problem = self.problem
-        motion = problem.scenarios[0].rollout.run(problem.schedule.expand(problem.levels(units)))
+        motion = problem.scenarios[0].rollout.run(problem.commands(units))
         return _information(problem.criterion, problem.moments(motion, 0), self.whole)
 
     def add(self, units: Array) -> None:
@@ -326,7 +326,8 @@ def _bound_hull(
     """Return the bound, its gap, the mixture's size, evaluations and ascents."""
     criterion = problems[0].criterion
     whole = len(problems) > 1 or len(criterion.wanted) <= _FEW
-    outer = criterion if whole else _wanted_only(criterion)
+    # of matrices that hold the wanted columns alone
+    outer = criterion if whole else replace(criterion, wanted=tuple(range(len(criterion.wanted))))
     rng = np.random.default_rng([13, seed])
     pools = [_Pool(p, u, whole) for p, u in zip(problems, units, strict=True)]
     weights, spent, ascents = [], 0, 0
@@ -378,11 +379,6 @@ def _bound_hull(
     bound = max(min(tangents), last) + drift + _slack(criterion)
     members = sum(int((w > 1e-3).sum()) for w in weights)
     return bound, bound - last, members, spent, ascents
-
-
-def _wanted_only(criterion: Criterion) -> Criterion:
-    """Return the criterion for matrices that hold the wanted columns alone."""
-    return replace(criterion, wanted=tuple(range(len(criterion.wanted))))
 
 
 def certify(
@@ -440,7 +436,7 @@ def certify(
     for i in range(count):
         alone = [_single(p, i, len(problems) == 1) for p in problems]
         total = [
-            p.moments(p.scenarios[0].rollout.run(_expand(p, u[None])), 0)
+            p.moments(p.scenarios[0].rollout.run(p.commands(u[None])), 0)
             for p, u in zip(alone, units, strict=True)
         ]
         value = float(first.criterion.value(sum(total[1:], total[0]))[0])
@@ -475,10 +471,6 @@ def certify(
         "",
         time.perf_counter() - began,
     )
-
-
-def _expand(problem: TrialProblem, units: Array) -> Array:
-    return problem.schedule.expand(problem.levels(units))
 
 
 def _single(problem: TrialProblem, scenario: int, known: bool) -> TrialProblem:

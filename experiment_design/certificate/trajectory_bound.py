@@ -153,7 +153,7 @@ def why_not_trajectory(problem: TrialProblem, *, relaxed: bool = False) -> str:
 
 def relaxed_value(problem: TrialProblem, unit: Array) -> float:
     """Return the criterion of a design if its error were the process noise alone."""
-    motion = problem.scenarios[0].rollout.run(problem.schedule.expand(problem.levels(unit[None])))
+    motion = problem.scenarios[0].rollout.run(problem.commands(unit[None]))
     information = problem.scenarios[0].information
     assert isinstance(information, MomentProgram)
     gram = problem.moments(motion, 0).gram
@@ -350,7 +350,7 @@ class _Trial:
         return np.stack([made.get(n, none) for n in self.rollout.structure.inputs], axis=-1)
 
     def _run_whole(self, units: Array) -> tuple[Array, Array, Array]:
-        motion = self.rollout.run(self.problem.schedule.expand(self.problem.levels(units)))
+        motion = self.rollout.run(self.problem.commands(units))
         good = motion.stable
         state = motion.state[good]
         return state[..., : self.nx], state[..., self.nx], motion.tau[good]

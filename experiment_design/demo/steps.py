@@ -33,51 +33,23 @@ class Step:
     told: tuple[str, ...]
 
 
-@dataclass(frozen=True)
 class Files:
-    """Where each step of the demo leaves its file."""
+    """Where each step of the demo leaves its file.
 
-    folder: Path
+    Parameters
+    ----------
+    folder : Path
+    """
 
-    @property
-    def prior(self) -> Path:
-        """The model that the first trial is designed with."""
-        return self.folder / "prior.json"
-
-    @property
-    def plan(self) -> Path:
-        """The designed commands."""
-        return self.folder / "plan.csv"
-
-    @property
-    def trial(self) -> Path:
-        """The log of the designed trial."""
-        return self.folder / "trial.csv"
-
-    @property
-    def other(self) -> Path:
-        """A log that takes no part in any fit."""
-        return self.folder / "other.csv"
-
-    @property
-    def model(self) -> Path:
-        """The estimated model."""
-        return self.folder / "model.json"
-
-    @property
-    def better(self) -> Path:
-        """The model extended by the cause that was found."""
-        return self.folder / "better.json"
-
-    @property
-    def next_plan(self) -> Path:
-        """The commands of the next trial."""
-        return self.folder / "next_plan.csv"
-
-    @property
-    def report(self) -> Path:
-        """The page."""
-        return self.folder / "report.html"
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        # the model that the first trial is designed with, and the designed commands
+        self.prior, self.plan = folder / "prior.json", folder / "plan.csv"
+        # the log of the designed trial, and one that takes no part in any fit
+        self.trial, self.other = folder / "trial.csv", folder / "other.csv"
+        # the estimated model, and that extended by the cause that was found
+        self.model, self.better = folder / "model.json", folder / "better.json"
+        self.next_plan, self.report = folder / "next_plan.csv", folder / "report.html"
 
     def hashes(self) -> dict[str, str]:
         """Return the SHA-256 of each step's file by its name."""

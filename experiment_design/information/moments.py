@@ -136,9 +136,10 @@ class MomentProgram:
             ca.substitute(s.at(e, d, theta, sample_time), s.air, air)
             for e in (ca.vertcat(*predictor.expressions), slopes)
         ]
-        self._std = np.array([std for _, std, _ in channels])
-        self._own = [own for _, _, own in channels]
-        self._process = np.asarray(noise.process, float)
+        # of each noise channel, and the state whose next sample it stands in too, if any
+        self.channel_std = np.array([std for _, std, _ in channels])
+        self.channel_own = tuple(own for _, _, own in channels)
+        self.process_std = np.asarray(noise.process, float)
         self._channels = len(channels)
         self._inputs = len(structure.inputs)
         if gust is None and blow.numel():
@@ -160,8 +161,6 @@ class MomentProgram:
         # what IPOPT's interval functions are built from
         self.symbols = (s.x, s.psi, s.tau)
         self.expressions = (z, a)
-        self.channel_own = tuple(self._own)
-        self.process = self._process
 
     def _signals(self, x: Array, psi: Array, tau: Array) -> list[Array]:
         return [
@@ -179,27 +178,11 @@ class MomentProgram:
         """
         return self._samples(self._signals(x, psi, tau))
 
-    @property
-    def channel_std(self) -> Array:
-        """Standard deviation of each noise channel, (channels,)."""
-        return self._std
-
-    @property
-    def process_std(self) -> Array:
-        """Standard deviation of the process noise, (nx,)."""
-        return self._process
-
     def _samples(self, signals: list[Array]) -> tuple[Array, Array]:
         shape = signals[0].shape
         out = np.empty((self._forward.size, *shape))
         self._forward(signals, out)
         return out[: self.columns], out[self.columns :].reshape(self.nx, self._channels, *shape)
-
-    def _rows(self, signals: list[Array]) -> tuple[Array, Array]:
-        """Return centred regressors (p, R, N) and slopes (nx, channels, R, N)."""
-        z, a = self._samples(signals)
-        z -= z.mean(axis=-1, keepdims=True)
-        return z, a
 
     def _prepare(self, x: Array, psi: Array, tau: Array) -> tuple[list[Array], Array, Array, Array]:
         """Return signals, centred regressors, slopes and scattered noise.
@@ -217,7 +200,8 @@ class MomentProgram:
         ):
             return last[3]
         signals = self._signals(x, psi, tau)
-        z, a = self._rows(signals)
+        z, a = self._samples(signals)
+        z -= z.mean(axis=-1, keepdims=True)
         s = np.empty(0) if self.white else self._scattered(z, a)
         found = (signals, z, a, s)
         if len(x) == 1:
@@ -234,9 +218,9 @@ class MomentProgram:
             for c in range(self._channels):
                 block = s[:, rows, c]
                 np.multiply(part, -a[i, c][:, None, :], out=block[..., :samples])
-                if self._own[c] == i:
+                if self.channel_own[c] == i:
                     block[..., 1:] += part
-                block *= self._std[c]
+                block *= self.channel_std[c]
         return s.reshape(runs, self.columns, -1)
 
     def _gram(self, z: Array) -> Array:
@@ -249,10 +233,13 @@ class MomentProgram:
 
     def _variances(self, a: Array) -> Array:
         """Return the average variance of each equation's error, (R, nx)."""
-        own = np.array([1.0 if o is not None else 0.0 for o in self._own]) * self._std**2
+        own = (
+            np.array([1.0 if o is not None else 0.0 for o in self.channel_own])
+            * self.channel_std**2
+        )
         mean = (a**2).mean(axis=-1)
-        spread = np.einsum("icr,c->ri", mean, self._std**2)
-        return np.asarray(spread + own[: self.nx] + self._process**2)
+        spread = np.einsum("icr,c->ri", mean, self.channel_std**2)
+        return np.asarray(spread + own[: self.nx] + self.process_std**2)
 
     def __call__(self, x: Array, psi: Array, tau: Array) -> Moments:
         """Return the moments of R sequences.
@@ -271,7 +258,7 @@ class MomentProgram:
         weights = (
             self._variances(a)
             if self.white
-            else np.broadcast_to(self._process**2, (len(gram), self.nx))
+            else np.broadcast_to(self.process_std**2, (len(gram), self.nx))
         )
         score = np.zeros_like(gram)
         for i, mine in enumerate(self.equations):
@@ -303,10 +290,10 @@ class MomentProgram:
         back = np.zeros((self._forward.size, samples))
         d_z = back[: self.columns]
         d_a = back[self.columns :].reshape(self.nx, self._channels, samples)
-        weights = self._variances(a)[0] if self.white else self._process**2
+        weights = self._variances(a)[0] if self.white else self.process_std**2
         if not self.white:
             q = (2.0 * d_score @ scattered[0]).reshape(self.columns, self._channels, samples + 1)
-            q *= self._std[None, :, None]
+            q *= self.channel_std[None, :, None]
         for i, mine in enumerate(self.equations):
             rows = slice(mine[0], mine[-1] + 1)
             part = z[rows, 0]
@@ -315,13 +302,13 @@ class MomentProgram:
             if self.white:
                 total = float((d_score[rows, rows] * (part @ part.T)).sum())
                 for c in range(self._channels):
-                    d_a[i, c] = 2.0 * total * self._std[c] ** 2 * a[i, c, 0] / samples
+                    d_a[i, c] = 2.0 * total * self.channel_std[c] ** 2 * a[i, c, 0] / samples
                 continue
             for c in range(self._channels):
                 mine_q = q[rows, c]
                 d_z[rows] -= a[i, c, 0] * mine_q[:, :samples]
                 d_a[i, c] = -(part * mine_q[:, :samples]).sum(axis=0)
-                if self._own[c] == i:
+                if self.channel_own[c] == i:
                     d_z[rows] += mine_q[:, 1:]
         d_z -= d_z.mean(axis=1, keepdims=True)
         out = np.empty((self._arguments, samples))

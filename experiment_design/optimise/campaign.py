@@ -78,7 +78,7 @@ def search_piece(piece: Piece) -> Candidate:
 def own_moments(problem: TrialProblem, unit: Array) -> tuple[Moments, ...]:
     """Return the sums of one sequence under each scenario."""
     alone = problem.with_known(())
-    commands = problem.schedule.expand(problem.levels(unit))
+    commands = problem.commands(unit)
     return tuple(
         alone.moments(s.rollout.run(commands[None]), i) for i, s in enumerate(problem.scenarios)
     )

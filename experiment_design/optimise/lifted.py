@@ -87,7 +87,7 @@ class MomentShooting(Shooting):
             self.others = all_columns * (all_columns + 1) // 2
         else:
             self.others = len(self.blocks)
-        process = y.process**2
+        process = y.process_std**2
         self.floor_variance = np.array(
             [
                 process[i]
@@ -153,9 +153,6 @@ class MomentShooting(Shooting):
     def _scaled(self) -> float:
         return 2 * float(np.log(self.score_scale).sum()) if self.exact else 0.0
 
-    def _earlier_score(self) -> Array | None:
-        return self.problem.known[0].score_covariance[0] if self.problem.known else None
-
     def _border(self, nuisance: list[int]) -> list[LogDet]:
         size, known = len(self.order), self._fixed_gram()
         matrix = Affine(size + len(nuisance))
@@ -168,8 +165,9 @@ class MomentShooting(Shooting):
 
     def _score_block(self, matrix: Affine, scale: Array) -> None:
         """Write M̃, rows and columns scaled, into the leading block."""
-        size, known = len(self.order), self._earlier_score()
-        process = self.information.process**2
+        size, earlier = len(self.order), self.problem.known
+        known = earlier[0].score_covariance[0] if earlier else None
+        process = self.information.process_std**2
         entry = self.grams
         for q in range(size):
             for p in range(q + 1):
@@ -182,10 +180,7 @@ class MomentShooting(Shooting):
                     self._gram_entry(matrix, p, q, p, q, weight, None)
                 if known is not None and c is not None and d is not None:
                     value = scale[p] * scale[q] * known[c, d]
-                    value /= self.size[c] * self.size[d]
-                    matrix.base[p, q] += value
-                    if p != q:
-                        matrix.base[q, p] += value
+                    matrix.add_constant(p, q, value / (self.size[c] * self.size[d]))
 
     # -- intervals --------------------------------------------------------------------------
 

@@ -49,6 +49,11 @@ class Affine:
             self.columns.append(entry)
             self.values.append(weight)
 
+    def add_constant(self, i: int, j: int, value: float) -> None:
+        """Add a constant at (i, j) and (j, i)."""
+        for a, b in {(i, j), (j, i)}:
+            self.base[a, b] += value
+
     def term(self, weight: float, entries: int, positive: int) -> LogDet:
         """Return its weighted log determinant."""
         slope = csc_matrix((self.values, (self.rows, self.columns)), shape=(self.size**2, entries))

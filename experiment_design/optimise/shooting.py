@@ -241,14 +241,10 @@ class Shooting(ABC):
         if (p, q) in self.gram_at:
             matrix.add(a, b, self.gram_at[p, q], weight)
         else:
-            matrix.base[a, b] += weight
-            if a != b:
-                matrix.base[b, a] += weight
+            matrix.add_constant(a, b, weight)
         if known is not None and c is not None and d is not None:
             value = weight * known[c, d] / (self.size[c] * self.size[d])
-            matrix.base[a, b] += value
-            if a != b:
-                matrix.base[b, a] += value
+            matrix.add_constant(a, b, value)
 
     def _terms(self) -> tuple[list[LogDet], float]:
         """Return −log det C as weighted log determinants and a constant."""

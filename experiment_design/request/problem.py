@@ -100,6 +100,10 @@ class TrialProblem:
         s = self.schedule
         return np.asarray(s.lower + (s.upper - s.lower) * unit)
 
+    def commands(self, unit: Array) -> Array:
+        """Return the commands at each sample, (..., N, nc), of unit coordinates (..., K, nc)."""
+        return self.schedule.expand(self.levels(unit))
+
     def moments(self, motion: Motion, scenario: int) -> Moments:
         """Return the sums of a scenario's motion, the known ones included."""
         return moments_of(self.scenarios[scenario].information, motion, self._known_to(scenario))
@@ -111,7 +115,7 @@ class TrialProblem:
         """Evaluate sequences (R, K, nc) of unit coordinates."""
         values, missed = [], []
         for first in range(0, len(unit), _TOGETHER):
-            commands = self.schedule.expand(self.levels(unit[first : first + _TOGETHER]))
+            commands = self.commands(unit[first : first + _TOGETHER])
             each, worst = [], None
             for i, scenario in enumerate(self.scenarios):
                 motion = scenario.rollout.run(commands)
@@ -159,7 +163,7 @@ class TrialProblem:
             gradient (K, nc); the limits h (n_h,), negative where kept.
         """
         s = self.schedule
-        commands = s.expand(self.levels(unit))
+        commands = self.commands(unit)
         motions = [sc.rollout.run(commands[None]) for sc in self.scenarios]
         parts: list[Slope | None] = [
             self.objective.slope(m, sc.information, self._known_to(i))

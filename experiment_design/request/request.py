@@ -573,23 +573,14 @@ def build_problem(
 
 
 def _candidate_rollout(request: PreparedRequest, candidate: CandidateModel, trial: int) -> Rollout:
-    start = candidate_start(request, candidate, trial)
+    # initial states and heading in the candidate's own order
+    known = dict(zip((*request.structure.states, "psi"), request.starts[trial], strict=True))
+    start = np.array([known[s] for s in (*candidate.structure.states, "psi")])
     vessel = request.vessel if candidate.vessel is None else candidate.vessel
     return Rollout(
-        vessel,
-        candidate.structure,
-        candidate.theta,
-        candidate.d,
-        start,
-        request.sample_time,
+        vessel, candidate.structure, candidate.theta, candidate.d, start, request.sample_time,
         candidate.integrator,
-    )
-
-
-def candidate_start(request: PreparedRequest, candidate: CandidateModel, trial: int) -> Array:
-    """Return a candidate's initial states and heading, in its own order."""
-    start = dict(zip((*request.structure.states, "psi"), request.starts[trial], strict=True))
-    return np.array([start[s] for s in (*candidate.structure.states, "psi")])
+    )  # fmt: skip
 
 
 def draw_gusts(request: PreparedRequest) -> Array:

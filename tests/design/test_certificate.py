@@ -135,7 +135,7 @@ def test_tangent_has_the_right_derivative(ship, whole):
     size = len(problem.criterion.wanted)
     draw = rng.normal(size=(size, size))
     c = problem.criterion
-    motion = problem.scenarios[0].rollout.run(problem.schedule.expand(problem.levels(unit[None])))
+    motion = problem.scenarios[0].rollout.run(problem.commands(unit[None]))
     info = _information(c, problem.moments(motion, 0), whole)[0]
     scale = 1 / np.sqrt(np.diag(info))
     weights = (draw @ draw.T) * np.outer(scale, scale)
@@ -203,10 +203,7 @@ def test_a_campaign_of_two_trials(ship):
     problem = make_problem(ship, "surge", 40.0)
     other = make_problem(ship, "surge", 40.0, start=(2.5, 0.0))
     units = surge_grid(4, 4)
-    sums = [
-        p.moments(p.scenarios[0].rollout.run(p.schedule.expand(p.levels(units))), 0)
-        for p in (problem, other)
-    ]
+    sums = [p.moments(p.scenarios[0].rollout.run(p.commands(units)), 0) for p in (problem, other)]
     best = -np.inf
     for i in range(len(units)):
         pair = replace(
@@ -224,9 +221,7 @@ def test_a_campaign_of_two_trials(ship):
 def test_known_sums_and_scenarios(ship):
     problem = make_problem(ship, "surge", 40.0)
     units = surge_grid(4, 6)
-    motion = problem.scenarios[0].rollout.run(
-        problem.schedule.expand(problem.levels(units[400:401]))
-    )
+    motion = problem.scenarios[0].rollout.run(problem.commands(units[400:401]))
     known = problem.with_known((problem.moments(motion, 0),))
     design = units[77]
     assert certify([known], [design]).bound >= best_of(known, units, 4)

@@ -570,7 +570,7 @@ def test_precision_of_a_given_plan():
         predict_precision(request, [still])
     problem = build_problem(request)
     reference, _ = best_random(problem, 0, 20)
-    commands = problem.schedule.expand(problem.levels(reference.unit))
+    commands = problem.commands(reference.unit)
     plan = dict(zip(("n", "alpha1", "alpha2"), commands.T, strict=True))
     found = predict_precision(request, [plan])
     assert found.logdet == pytest.approx(assess(problem, reference.unit[None])[0].value)

@@ -34,7 +34,7 @@ def _first(request):
 
 def _commands(problem, seed=0):
     unit = (np.random.default_rng(seed).random(problem.shape) < 0.5).astype(float)
-    return problem.schedule.expand(problem.levels(unit))
+    return problem.commands(unit)
 
 
 def test_distance_equals_filters_stepped_by_hand():

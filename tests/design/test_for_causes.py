@@ -296,7 +296,7 @@ def test_a_diagnosis_names_the_right_cause_as_often_as_after_the_best_random_ste
     power = CausePower(problem.scenarios[0].rollout, plan.causes, request.noise, SIGNIFICANT, 2)
     envelope, _ = operating_envelope(request, model, {})
     begun = exchange_settings(problem, envelope, power.values, 0, effort=0.01, tries=1).reference
-    random = problem.schedule.expand(problem.levels(begun.unit))
+    random = problem.commands(begun.unit)
     right = [
         sum(
             [c.id for c in diagnose(

@@ -184,7 +184,7 @@ def test_a_setting_that_leaves_the_speeds_is_held_for_as_long_as_it_does_not() -
     best = exchange_settings(
         problem, found, lambda m: found.error_without_parts(m, 0.0, 4) ** -1, 1, effort=0.1
     ).candidate
-    plan = found.rollout.run(problem.schedule.expand(problem.levels(best.unit))[None])
+    plan = found.rollout.run(problem.commands(best.unit)[None])
     assert found.within(plan).all()
     assert not found.within(long).all()
 

@@ -50,7 +50,7 @@ def test_a_limit_that_the_late_motion_misses_is_named():
     """The note holds the number that the reports do."""
     request = make_request(duration=60.0, vessel=late_ship())
     problem = build_problem(request)
-    commands = problem.schedule.expand(problem.levels(np.zeros(problem.shape)))
+    commands = problem.commands(np.zeros(problem.shape))
     motion = problem.scenarios[0].rollout.run(commands[None], late=True)
     reports = (LimitReport(0, "u", 0.5, "m/s", 0.0), LimitReport(0, "v", 0.4, "m/s", 0.123))
     asked = replace(request, contrasts=((CandidateModel("a", *_explanation(request)),) * 2,))
@@ -116,5 +116,5 @@ def test_two_explanations_may_differ_in_a_thruster():
         rival = CandidateModel("weak", *_explanation(request), vessel)
         problem = build_problem(replace(request, contrasts=((first, rival),)))
         unit = np.random.default_rng(3).random((1, *problem.shape))
-        value = problem.contrast.value(problem.schedule.expand(problem.levels(unit)))
+        value = problem.contrast.value(problem.commands(unit))
         assert (np.exp(value) > 100).all() == told

@@ -250,7 +250,7 @@ def test_tightening_gives_up_no_limit_that_was_asked_for():
     request = replace(request, covariance=np.diag((0.05 * request.theta) ** 2))
     problem = build_problem(request)
     drawn = np.random.default_rng(0).random((60, *problem.shape))
-    state = problem.scenarios[0].rollout.run(problem.schedule.expand(problem.levels(drawn))).state
+    state = problem.scenarios[0].rollout.run(problem.commands(drawn)).state
     sway = state[:, :, 1]
     slow, fast = int(sway.min(axis=1).argmin()), int(sway.min(axis=1).argmax())
     limits = TrialLimits(

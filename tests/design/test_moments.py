@@ -24,7 +24,7 @@ from greybox.vessel.toml import load_vessel
 def _random_motion(request, seed=0, count=1):
     problem = build_problem(request)
     unit = np.random.default_rng(seed).random((count, *problem.shape))
-    motion = problem.scenarios[0].rollout.run(problem.schedule.expand(problem.levels(unit)))
+    motion = problem.scenarios[0].rollout.run(problem.commands(unit))
     return problem, unit, motion
 
 
@@ -209,7 +209,7 @@ def test_predicted_errors_are_those_of_monte_carlo(predictor):
     problem = build_problem(request)
     rng = np.random.default_rng(1)
     unit = (rng.random(problem.shape) < 0.5).astype(float)
-    commands = problem.schedule.expand(problem.levels(unit))
+    commands = problem.commands(unit)
     motion = problem.scenarios[0].rollout.run(commands[None])
     predicted = np.sqrt(np.diag(problem.criterion.covariance(problem.moments(motion, 0))[0]))
     runs, samples = 200, len(commands)

@@ -84,7 +84,7 @@ def test_objective_with_ramps_cut_holds_nuisance_and_earlier_trials(
     rng = np.random.default_rng(1)
     unit = rng.random((2, *p.shape))
     if not white:
-        motion = p.scenarios[0].rollout.run(p.schedule.expand(p.levels(unit[:1])))
+        motion = p.scenarios[0].rollout.run(p.commands(unit[:1]))
         p = p.with_known((p.moments(motion, 0),))
     value = make_shooting(p, unit[0]).value(unit[1])
     assert value == pytest.approx(p.evaluate(unit[1:]).value[0], abs=1e-8)

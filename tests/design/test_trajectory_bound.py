@@ -166,7 +166,7 @@ def test_what_has_no_bound_of_this_kind(ship):
     assert found.kind is Kind.NOT_AVAILABLE
     assert "sensitivities as states" in found.sentence()
     plain = make_problem(ship, "thesis", 60.0, white=True)
-    motion = plain.scenarios[0].rollout.run(plain.schedule.expand(plain.levels(unit[None])))
+    motion = plain.scenarios[0].rollout.run(plain.commands(unit[None]))
     known = plain.with_known((plain.moments(motion, 0),))
     assert "earlier" in why_not_trajectory(known)
     ramped = replace(plain, schedule=replace(plain.schedule, ramp=(2, 1, 1)))
