@@ -184,7 +184,7 @@ class Design(DisplayMixin):
         return float(np.exp(gain / len(self.names)))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON, those of the contract first."""
+        """Return the fields for JSON, the main ones first."""
         r = self.request
         return {
             "status": self.status,

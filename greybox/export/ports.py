@@ -50,10 +50,10 @@ class Port:
         return "unit of the log" if self.unit is None else self.unit
 
 
-def channel_port(name: str, value: float = 0.0, label: str | None = None) -> Port:
+def channel_port(name: str, label: str | None = None) -> Port:
     """Return the port of a canonical channel, under another name where one is given."""
     channel = CHANNELS[name]
-    return Port(label or name, channel.unit, channel.meaning, value)
+    return Port(label or name, channel.unit, channel.meaning)
 
 
 def command_ports(vessel: Vessel) -> list[Port]:

@@ -99,13 +99,13 @@ def measure(
     run: int,
     length: float,
     *,
-    rudder: float | None,
-    full_rudder: float | None,
-    executes: np.ndarray | None,
-    heading: float | None,
-    end_speed: float | None,
-    reversed_thrust: bool,
-    scale: float,
+    rudder: float | None = None,
+    full_rudder: float | None = None,
+    executes: np.ndarray | None = None,
+    heading: float | None = None,
+    end_speed: float | None = None,
+    reversed_thrust: bool = False,
+    scale: float = 1.0,
 ) -> Manoeuvre | None:
     """Measure one run; what it did not reach is None, as is a zig-zag that never swings back.
 

@@ -236,12 +236,7 @@ def predict_manoeuvre(
         helm.sentence if manoeuvre in ("turning", "zigzag") else helm.propulsion,
         tuple(made),
         asked.draws,
-        (
-            *model_notes(model, helm, asked),
-            *(d.sentence for d in elsewhere),
-            *told_rates,
-            *shared,
-        ),
+        (*model_notes(model, helm, asked), *(d.sentence for d in elsewhere), *told_rates, *shared),
         elsewhere,
         trust_level(model),
         prediction_level(model),
@@ -342,14 +337,8 @@ def _trial_current(
         )  # fmt: skip
         if runs.diverged[0]:
             continue
-        length = model.vessel.length
-        own = [
-            measure(
-                runs, i, length, rudder=None, full_rudder=None, executes=None, heading=None,
-                end_speed=None, reversed_thrust=False, scale=1.0,
-            )
-            for i in np.flatnonzero(~runs.diverged).tolist()
-        ]  # fmt: skip
+        stays = np.flatnonzero(~runs.diverged).tolist()
+        own = [measure(runs, i, model.vessel.length) for i in stays]
         sets.append((found, [m for m in own if isinstance(m, TurningCircle)]))
     return TrialCurrent.of(sets)
 

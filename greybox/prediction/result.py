@@ -227,9 +227,7 @@ class PredictedManoeuvre:
                         "unit": "m" if lengths else "rad",
                         "source": "IMO MSC.137(76)",
                     }
-                    row["verdict_reason"] = criterion.reason
-                else:
-                    row["verdict_reason"] = criterion.reason
+                row["verdict_reason"] = criterion.reason
             if name in measured:
                 beside = measured[name]
                 row["measured"] = {

@@ -35,7 +35,7 @@ STILL = np.zeros(4)
 
 
 def make_problem(ship, name, duration, kind="D", *, white=False, start=None, predictor="basic"):
-    """Return the trial of issue 4: thesis's ship, (6.2), hold 10 s."""
+    """Return a trial of the thesis's ship with the noises of (6.2), held 10 s."""
     structure = get_structure(name)
     theta = np.array([TRUE[n] for n in structure.parameters])
     nx = len(structure.states)

@@ -45,45 +45,34 @@ def require_plan(plan, name, said, notes, *parts):
     assert any("no trial is known" in n for n in notes)
 
 
+LONG = pytest.mark.long
+# a plan for prediction, of the whole model
+WHOLE = (BRIEF, ("trial", "validation"))
+
+
 @pytest.mark.parametrize(
-    ("name", "duration", "hold"),
+    ("name", "duration", "hold", "options", "parts"),
     [
-        ("kvlcc2-320m", "250", "50"),
-        pytest.param("kvlcc2-7m", "60", "20", marks=pytest.mark.long),
-        pytest.param("training-ship-105m", "150", "50", marks=pytest.mark.long),
-        ("research-catamaran-29m", "60", "20"),
+        ("kvlcc2-320m", "250", "50", FAST, ()),
+        pytest.param("kvlcc2-7m", "60", "20", FAST, (), marks=LONG),
+        pytest.param("training-ship-105m", "150", "50", FAST, (), marks=LONG),
+        ("research-catamaran-29m", "60", "20", FAST, ()),
+        pytest.param("kvlcc2-320m", "900", "60", *WHOLE, marks=LONG),
+        pytest.param("training-ship-105m", "900", "30", *WHOLE, marks=LONG),
+        pytest.param("research-catamaran-29m", "300", "10", *WHOLE, marks=LONG),
     ],
 )
-def test_a_plan_comes_for_each_kind_of_ship(tmp_path, capsys, name, duration, hold):
+def test_a_plan_comes_for_each_kind_of_ship(
+    tmp_path, capsys, name, duration, hold, options, parts
+):  # fmt: skip
     out = tmp_path / "design.json"
     status, plan = design(
         tmp_path, vessel_file(tmp_path, name), "--prior", "none", "--duration", duration,
-        "--hold", hold, "--json", str(out), *FAST,
+        "--hold", hold, "--json", str(out), *options,
     )  # fmt: skip
     said = capsys.readouterr()
     assert status == 0, said.err
-    require_plan(plan, name, said.out, json.loads(out.read_text())["notes"])
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "duration", "hold"),
-    [
-        ("kvlcc2-320m", "900", "60"),
-        ("training-ship-105m", "900", "30"),
-        ("research-catamaran-29m", "300", "10"),
-    ],
-)
-def test_a_plan_for_prediction_of_the_whole_model(tmp_path, capsys, name, duration, hold):
-    out = tmp_path / "design.json"
-    status, plan = design(
-        tmp_path, vessel_file(tmp_path, name), "--prior", "none", "--duration", duration,
-        "--hold", hold, "--json", str(out), *BRIEF,
-    )  # fmt: skip
-    said = capsys.readouterr()
-    assert status == 0, said.err
-    notes = json.loads(out.read_text())["notes"]
-    require_plan(plan, name, said.out, notes, "trial", "validation")
+    require_plan(plan, name, said.out, json.loads(out.read_text())["notes"], *parts)
 
 
 def test_sheet_and_page_say_it_first(tmp_path):
