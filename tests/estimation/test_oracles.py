@@ -26,6 +26,7 @@ from greybox.estimation.covariance import (
     segment_sums,
 )
 from greybox.estimation.normal_equations import solve_stacked
+from greybox.numerics.lagged_moments import bartlett_sums
 
 ROWS = 400
 
@@ -96,11 +97,7 @@ def test_least_squares_with_memory_equals_statsmodels():
     solution = solve_stacked([x], [x], [y])
     oracle = sm.OLS(y, x.T).fit(cov_type="HAC", cov_kwds={"maxlags": 5, "use_correction": False})
     residual = y - solution.theta @ x
-    scores = x * residual
-    middle = scores @ scores.T
-    for lag in range(1, 6):
-        block = scores[:, lag:] @ scores[:, :-lag].T
-        middle += (1 - lag / 6) * (block + block.T)
+    middle = bartlett_sums((x * residual).T, 5)
     inverse = np.linalg.inv(solution.information)
     np.testing.assert_allclose(solution.theta, oracle.params, rtol=1e-8)
     np.testing.assert_allclose(inverse @ middle @ inverse, oracle.cov_params(), rtol=1e-8)

@@ -130,6 +130,13 @@ def problem(predictor, log, heading="output"):
     return model, measured(model, log), p
 
 
+def slope_of(function, p, j, floor=1e-3):
+    """Return the central difference of a function in one of its parameters."""
+    h = 1e-6 * max(abs(p[j]), floor)
+    step = h * np.eye(len(p))[j]
+    return (function(p + step) - function(p - step)) / (2 * h)
+
+
 class TestSensitivities:
     def test_equal_finite_differences(self, predictor, noisy):
         model, data, p = problem(predictor, noisy)
@@ -137,19 +144,11 @@ class TestSensitivities:
         z0 = data.y[:1]
         _, rows, _, slope = runs.sensitivities(z0, p)
         for j in range(len(p)):
-            h = 1e-6 * max(abs(p[j]), 1e-3)
-            up, down = p.copy(), p.copy()
-            up[j] += h
-            down[j] -= h
-            (y1, end1), (y0, end0) = runs(z0, up), runs(z0, down)
-            expected = (y1 - y0) / (2 * h)
+            expected, end = (slope_of(lambda p, k=k: runs(z0, p)[k], p, j) for k in (0, 1))
             size = np.abs(expected).max()
             np.testing.assert_allclose(rows[..., j], expected, atol=1e-5 * size)
-            np.testing.assert_allclose(
-                slope[..., j],
-                (end1 - end0) / (2 * h),
-                atol=1e-5 * np.abs(slope[..., j]).max() + 1e-9,
-            )
+            atol = 1e-5 * np.abs(slope[..., j]).max() + 1e-9
+            np.testing.assert_allclose(slope[..., j], end, atol=atol)
 
     def test_of_the_initial_state_too(self, predictor, noisy):
         model, data, p = problem(predictor, noisy)
@@ -211,11 +210,7 @@ class TestSensitivities:
         rows = observer(z0, p, 0.3)[1]
         assert (rows[:, 150:] == 0).all()
         for j in range(len(p)):
-            h = 1e-6 * max(abs(p[j]), 1e-3)
-            up, down = p.copy(), p.copy()
-            up[j] += h
-            down[j] -= h
-            expected = (observer(z0, down, 0.3)[0] - observer(z0, up, 0.3)[0]) / (2 * h)
+            expected = -slope_of(lambda p: observer(z0, p, 0.3)[0], p, j)
             np.testing.assert_allclose(rows[..., j], expected, atol=1e-5 * np.abs(expected).max())
 
     def test_an_observer_of_more_sensors_than_states(self, predictor):
@@ -231,11 +226,7 @@ class TestSensitivities:
             observer(z0, p, 0.0)[1], runs.sensitivities(z0, p)[1], rtol=1e-9, atol=1e-9
         )
         for j in (0, len(p) - 1):
-            h = 1e-6 * max(abs(p[j]), 1e-3)
-            up, down = p.copy(), p.copy()
-            up[j] += h
-            down[j] -= h
-            expected = (observer(z0, down, 0.5)[0] - observer(z0, up, 0.5)[0]) / (2 * h)
+            expected = -slope_of(lambda p: observer(z0, p, 0.5)[0], p, j)
             found = observer(z0, p, 0.5)[1][..., j]
             np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
@@ -245,12 +236,7 @@ class TestSensitivities:
         noise = np.array([2e-4, 2e-4, 2e-4, 1e-4, 1e-5, 1e-5, 1e-6, 1e-8])
         _, by_start, by_p = kalman.likelihood(data.y[:1], p, noise)
         for j in (0, 1, 3, 7, 17, 18):
-            h = 1e-6 * max(abs(p[j]), 1e-2)
-            up, down = p.copy(), p.copy()
-            up[j] += h
-            down[j] -= h
-            slope = kalman.likelihood(data.y[:1], up, noise)[0]
-            slope = (slope - kalman.likelihood(data.y[:1], down, noise)[0]) / (2 * h)
+            slope = slope_of(lambda p: kalman.likelihood(data.y[:1], p, noise)[0], p, j, 1e-2)
             assert by_p[j] == pytest.approx(slope, rel=1e-4, abs=1e-3 * np.abs(by_p).max())
         assert np.isfinite(by_start).all()
 

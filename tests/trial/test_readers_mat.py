@@ -438,14 +438,11 @@ def check_cut_files(tmp_path, kind, shares):
 
 
 @pytest.mark.parametrize("kind", ["five", "packed", "four"])
-def test_cut_files_are_refused(tmp_path, kind):
-    check_cut_files(tmp_path, kind, [0.2, 0.6, 0.99])
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", ["five", "packed", "four"])
-def test_files_cut_anywhere_are_refused(tmp_path, kind):
-    check_cut_files(tmp_path, kind, np.linspace(0, 0.999, 12))
+@pytest.mark.parametrize(
+    "shares", [[0.2, 0.6, 0.99], pytest.param(np.linspace(0, 0.999, 12), marks=pytest.mark.long)]
+)
+def test_cut_files_are_refused(tmp_path, kind, shares):
+    check_cut_files(tmp_path, kind, shares)
 
 
 def test_cut_hdf_files_are_refused(tmp_path):

@@ -117,8 +117,27 @@ class _Evaluator:
         trigger()
 
 
+_Found = TypeVar("_Found", bound=tuple[Array, ...])
+
+
+def _kept(last: tuple[tuple[Array, ...], _Found] | None, *point: Array) -> _Found | None:
+    """Return what was found last, if it was at this point."""
+    if last is None:
+        return None
+    return last[1] if all(map(np.array_equal, last[0], point)) else None
+
+
+def _fixed(*arrays: Array) -> Any:
+    """Return arrays that nothing can write to."""
+    for array in arrays:
+        array.flags.writeable = False
+    return arrays
+
+
 class _Runs:
     """A step taken along runs side by side, with derivatives and buffers.
+
+    The latest run is kept: derivatives are asked for where it was run before.
 
     Parameters
     ----------
@@ -137,11 +156,23 @@ class _Runs:
         self._blocks: dict[bool, list[tuple[slice, Array, dict[int, Any]]]] = {}
         # those of the module are found by the hash of a model, which takes longer
         self._tables: dict[bool, _Table] = {}
+        self._last: tuple[tuple[Array, ...], tuple[Array, ...]] | None = None
 
     def __call__(
         self, carried: Sequence[Array], constant: Sequence[Array]
-    ) -> tuple[list[Array], list[Array]]:
-        """Return what is carried after each step, and what is found, each (M, m, ·)."""
+    ) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        """Return what is carried after each step, and what is found, each (M, m, ·).
+
+        None of it is to be written to.
+        """
+        point = (*carried, *constant)
+        out = _kept(self._last, *point)
+        if out is None:
+            out = _fixed(*self._run(carried, constant))
+            self._last = tuple(a.copy() for a in point), out
+        return out[: len(carried)], out[len(carried) :]
+
+    def _run(self, carried: Sequence[Array], constant: Sequence[Array]) -> list[Array]:
         step, count = _plain_step(self._build, self._model), len(carried)
         loop = loop_of(step, count)
         out = [np.empty((self.runs, self.steps, step.numel_out(i))) for i in range(step.n_out())]
@@ -155,7 +186,7 @@ class _Runs:
         else:
             function = along(step, count, self.steps, self.runs)
             self._evaluate(function, (*carried, self._read, *constant), tuple(out))
-        return out[:count], out[count:]
+        return out
 
     def _prepared(
         self, table: _Table, first: int, starts: bool
@@ -237,23 +268,6 @@ class _Runs:
         return shown, slope
 
 
-_Found = TypeVar("_Found", bound=tuple[Array, ...])
-
-
-def _kept(last: tuple[tuple[Array, ...], _Found] | None, *point: Array) -> _Found | None:
-    """Return what was found last, if it was at this point."""
-    if last is None:
-        return None
-    return last[1] if all(map(np.array_equal, last[0], point)) else None
-
-
-def _fixed(*arrays: Array) -> Any:
-    """Return arrays that nothing can write to."""
-    for array in arrays:
-        array.flags.writeable = False
-    return arrays
-
-
 class Simulator:
     """Free runs of equal length side by side, with sensitivities and buffers.
 
@@ -271,31 +285,21 @@ class Simulator:
     def __init__(self, model: OutputModel, w: Array) -> None:
         self.model = model
         self._runs = _Runs(free_run_step, model, w)
-        # the latest run, and the latest whose derivatives were asked for
-        self._ran: tuple[tuple[Array, ...], tuple[Array, Array]] | None = None
+        # the latest run whose derivatives were asked for
         self._last: tuple[tuple[Array, ...], tuple[Array, Array, Array, Array]] | None = None
-
-    def _run(self, z0: Array, p: Array) -> tuple[Array, Array]:
-        """Return outputs and the states after each step, not to be written to."""
-        found = _kept(self._ran, z0, p)
-        if found is None:
-            (states,), (y,) = self._runs([z0], [p])
-            found = _fixed(y, states)
-            self._ran = (z0.copy(), p.copy()), found
-        return found
 
     def __call__(self, z0: Array, p: Array) -> tuple[Array, Array]:
         """Return outputs (M, m, ny) and the states after the last step (M, nz)."""
         kept = _kept(self._last, z0, p)
         if kept is not None:
             return kept[0], kept[2]
-        y, states = self._run(z0, p)
+        (states,), (y,) = self._runs([z0], [p])
         return y, states[:, -1]
 
     def by_parameters(self, z0: Array, p: Array, only: Sequence[int]) -> Array:
         """Return derivatives of the outputs in some parameters, (M, m, ny, len(only))."""
-        _, states = self._run(z0, p)
-        return self._runs.slopes([z0], [p], [states], starts=False, only=only)[0]
+        states, _ = self._runs([z0], [p])
+        return self._runs.slopes([z0], [p], states, starts=False, only=only)[0]
 
     def sensitivities(self, z0: Array, p: Array) -> tuple[Array, Array, Array, Array]:
         """Run with derivatives.
@@ -316,7 +320,7 @@ class Simulator:
         """
         kept = _kept(self._last, z0, p)
         if kept is None:
-            y, states = self._run(z0, p)
+            (states,), (y,) = self._runs([z0], [p])
             rows, slope = self._runs.slopes([z0], [p], [states])
             kept = _fixed(y, rows, states[:, -1], slope)
             self._last = (z0.copy(), p.copy()), kept
@@ -337,23 +341,12 @@ class Observer:
         self.model = model
         self._runs = _Runs(observer_step, model, np.concatenate([w, y, use[..., None]], axis=2))
         self._unused = use == 0
-        # the latest run: derivatives are asked for where it was run before
-        self._ran: tuple[tuple[Array, ...], tuple[Array, Array]] | None = None
-
-    def _run(self, z0: Array, p: Array, gain: Array) -> tuple[Array, Array]:
-        """Return errors and the states after each step, not to be written to."""
-        found = _kept(self._ran, z0, p, gain)
-        if found is None:
-            (states,), (error,) = self._runs([z0], [p, gain])
-            found = _fixed(error, states)
-            self._ran = (z0.copy(), p.copy(), gain.copy()), found
-        return found
 
     def by_parameters(self, z0: Array, p: Array, gain: float, only: Sequence[int]) -> Array:
         """Return derivatives of h(z) in some parameters, (M, m, ny, len(only))."""
         constant = [p, np.array([gain])]
-        _, states = self._run(z0, *constant)
-        rows, _ = self._runs.slopes([z0], constant, [states], starts=False, only=only)
+        states, _ = self._runs([z0], constant)
+        rows, _ = self._runs.slopes([z0], constant, states, starts=False, only=only)
         if self._unused.any():
             rows[self._unused] = 0.0
         return rows
@@ -379,10 +372,10 @@ class Observer:
             (M, m, ny, q + nz), without columns where they are not asked for.
         """
         constant = [p, np.array([gain])]
-        error, states = self._run(z0, *constant)
+        states, (error,) = self._runs([z0], constant)
         if not sensitivities:
             return error, np.empty((*error.shape, 0))
-        rows, _ = self._runs.slopes([z0], constant, [states])
+        rows, _ = self._runs.slopes([z0], constant, states)
         if self._unused.any():
             rows[self._unused] = 0.0
         return error, rows
@@ -410,17 +403,6 @@ class Filter:
         nz = len(model.states)
         self._certain = np.zeros((len(w), nz * (nz + 1) // 2))
         self._evaluate = _Evaluator()
-        # the latest run: derivatives are asked for where it was run before
-        self._ran: tuple[tuple[Array, ...], tuple[Array, Array, Array, Array]] | None = None
-
-    def _run(self, z0: Array, p: Array, noise: Array) -> tuple[Array, Array, Array, Array]:
-        """Return innovations, log variances, states and covariances, not to be written to."""
-        found = _kept(self._ran, z0, p, noise)
-        if found is None:
-            after, shown = self._runs([z0, self._certain], [p, noise])
-            found = _fixed(*shown, *after)
-            self._ran = (z0.copy(), p.copy(), noise.copy()), found
-        return found
 
     def __call__(
         self, z0: Array, p: Array, noise: Array, *, sensitivities: bool = True
@@ -444,7 +426,7 @@ class Filter:
             without columns where they are not asked for; and the logarithms of their
             variances (M, m, ny).
         """
-        innovations, levels, *after = self._run(z0, p, noise)
+        after, (innovations, levels) = self._runs([z0, self._certain], [p, noise])
         if not sensitivities:
             return innovations, np.empty((*innovations.shape, 0)), levels
         rows, _ = self._runs.slopes([z0, self._certain], [p, noise], after)
@@ -464,8 +446,9 @@ class Filter:
             (M, m, ny, ny + nz) of the innovations of unit variance and of the logarithms of
             their variances.
         """
-        innovations, _, *after = self._run(z0, p, noise)
-        carried, ny = [z0, self._certain], innovations.shape[2]
+        carried = [z0, self._certain]
+        after, (innovations, _) = self._runs(carried, [p, noise])
+        ny = innovations.shape[2]
         rows, _ = self._by_noise.slopes(carried, [p, noise], after, starts=False)
         return rows[:, :, :ny], rows[:, :, ny:]
 
