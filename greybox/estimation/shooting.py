@@ -29,6 +29,7 @@ from scipy.sparse.linalg import splu
 from greybox.model.output import OutputModel
 from greybox.model.run.output_runs import Simulator
 from greybox.numerics.effort import require_time
+from greybox.numerics.robust import huber_loss, huber_weights
 
 Array = NDArray[np.float64]
 Loss = Literal["gaussian", "huber"]
@@ -38,7 +39,6 @@ TOLERANCE = 1e-6
 # starts and ends of segments meet within this many noise deviations
 _JOINED = 1e-6
 _MOST = 60
-_HUBER = 1.345
 # relative singular value of the scaled normal equations below which a direction is unknown
 RANK = 1e-10
 # a run this many times beyond the largest measured value has escaped
@@ -265,7 +265,7 @@ def loss_weights(r: Array, loss: Loss) -> Array:
     """Return the weight of each squared residual (iteratively reweighted)."""
     if loss == "gaussian":
         return np.ones_like(r)
-    return np.asarray(np.minimum(1.0, _HUBER / np.maximum(np.abs(r), 1e-12)))
+    return huber_weights(r)
 
 
 def loss_value(r: Array, loss: Loss) -> float:
@@ -274,8 +274,7 @@ def loss_value(r: Array, loss: Loss) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
         if loss == "gaussian":
             return 0.5 * float((r**2).sum())
-        size = np.abs(r)
-        return float(np.where(size <= _HUBER, 0.5 * r**2, _HUBER * (size - _HUBER / 2)).sum())
+        return float(huber_loss(r).sum())
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ def bartlett_sums(rows: Array, lags: int) -> Array:
     return np.asarray(windows.T @ windows / width)
 
 
-def _memory(series: Array) -> Array:
+def lag_one_correlation(series: Array) -> Array:
     """Return the lag-one correlation of each column of a series (N, m), (m,)."""
     square = (series**2).sum(axis=0)
     square[square == 0] = 1.0
@@ -156,7 +156,7 @@ def correlation_factor(series: Array) -> float:
 
     That of a first-order autoregression with the lag-one correlation, averaged over columns.
     """
-    rho = np.clip(_memory(series), 0.0, 1 - 1 / max(len(series), 2))
+    rho = np.clip(lag_one_correlation(series), 0.0, 1 - 1 / max(len(series), 2))
     return float(np.mean((1 + rho) / (1 - rho)))
 
 
@@ -167,6 +167,6 @@ def automatic_lags(series: Array) -> int:
     ----------
     Andrews (1991), eq. 6.2 and 6.4, a first-order autoregression for each column.
     """
-    rho = np.clip(_memory(series), -0.99, 0.99)
+    rho = np.clip(lag_one_correlation(series), -0.99, 0.99)
     alpha = np.mean(4 * rho**2 / ((1 - rho) ** 2 * (1 + rho) ** 2))
     return int(min(np.ceil(1.1447 * (alpha * len(series)) ** (1 / 3)), len(series) // 4))

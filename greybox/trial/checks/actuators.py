@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.lagged_moments import bartlett_sums, lag_one_correlation
 from greybox.numerics.recursion import propagate
-from greybox.numerics.robust import robust_deviation
+from greybox.numerics.robust import HUBER, huber_loss, huber_weights, robust_deviation
 from greybox.trial.actuator_estimate import ActuatorEstimate, Measured
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import orderly
@@ -42,8 +43,6 @@ _FEWEST_SAMPLES, _FEWEST_CHANGES = 60, 5
 _LEAST_EXPLAINED = 0.3
 # what of the feedback is no spike: quantiles
 _USUAL = (0.005, 0.995)
-# Huber's bound in robust standard deviations
-_HUBER = 1.345
 # gain in twice the log-likelihood (of samples that count as independent) and in the size of the
 # residual for which a rate limit or a dead band is taken in
 _LEAST_GAIN, _LEAST_SHARE = 12.0, 0.05
@@ -274,8 +273,7 @@ def _scale(rest: Array) -> float:
 
 
 def _huber(rest: Array, scale: float) -> float:
-    size = np.abs(rest) / scale
-    return float(np.mean(np.where(size <= _HUBER, size**2, 2 * _HUBER * size - _HUBER**2)))
+    return 2 * float(np.mean(huber_loss(rest / scale)))
 
 
 def _fit(pairs: Sequence[_Pair], kind: ActuatorKind) -> _Fit | None:
@@ -350,7 +348,7 @@ def _improve(
         loss, damping, before = _huber(rest, scale), 1e-3, theta.copy()
         for _ in range(12):
             slope = _slope(theta, free, pairs, kind)
-            weight = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(rest), 1e-300))
+            weight = huber_weights(rest / scale)
             size = np.sqrt(np.einsum("ij,ij->j", slope, slope))
             size[size == 0] = 1.0
             j = slope / size
@@ -570,26 +568,19 @@ def _covariance(fit: _Fit, pairs: Sequence[_Pair], kind: ActuatorKind) -> Array:
     size = np.sqrt(np.mean(slope**2, axis=0))
     size[size == 0] = 1.0
     slope = slope / size
-    bound = _HUBER * fit.scale
+    bound = HUBER * fit.scale
     inside = np.abs(fit.rest) <= bound
     scores = slope * np.clip(fit.rest, -bound, bound)[:, None]
     bread = (slope * inside[:, None]).T @ slope
     meat = np.zeros_like(bread)
     reached = count = 0
     for s in _parts(scores, pairs):
-        n = len(s)
-        power = np.sum(s**2, axis=0)
-        near = np.sum(s[1:] * s[:-1], axis=0) / np.where(power > 0, power, 1.0)
-        rho = np.clip(near, -0.9, 0.995)
+        rho = np.clip(lag_one_correlation(s), -0.9, 0.995)
         alpha = float(np.max(4 * rho**2 / ((1 - rho) ** 2 * (1 + rho) ** 2)))
-        reach = 1 + int(min(2 * 1.1447 * (alpha * n) ** (1 / 3), n / 4))
-        # Bartlett weights are the mean square of sums over `reach` neighbours
-        sums = np.vstack([np.zeros((1, s.shape[1])), np.cumsum(s, axis=0)])
-        after = sums[np.minimum(np.arange(1 - reach, n) + reach, n)]
-        window = after - sums[np.maximum(np.arange(1 - reach, n), 0)]
-        meat += window.T @ window / reach
-        reached += reach
-        count += n
+        lags = int(min(2 * 1.1447 * (alpha * len(s)) ** (1 / 3), len(s) / 4))
+        meat += bartlett_sums(s, lags)
+        reached += 1 + lags
+        count += len(s)
     p = len(fit.free)
     inverse = np.linalg.pinv(bread, rcond=1e-10)
     # the more of the log the weights reach over, the less certain is the covariance itself
