@@ -16,8 +16,7 @@ from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.column_names import Assigned, assign, is_short_pair
 from greybox.trial.convert.derived_signals import usual_reach, wraps_by_degrees
-from greybox.trial.convert.file_clocks import on_one_clock
-from greybox.trial.convert.merge import merge
+from greybox.trial.convert.merge import merge, on_one_clock
 from greybox.trial.convert.settle_axes import settle_axes
 from greybox.trial.convert.time_scale import TimeScale, time_scale
 from greybox.trial.log import Provenance

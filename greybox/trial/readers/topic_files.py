@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,6 @@ from greybox.trial.readers.ros.axes import (
     tells_axes,
 )
 from greybox.trial.readers.table import Batch, TableFile
-from greybox.trial.steps import Step
 from greybox.units import EARLIEST_UNIX, unix_seconds
 
 Array = NDArray[np.float64]
@@ -71,6 +70,8 @@ class _Column:
 class TopicTable:
     """A table of messages, with what ROS says of their fields made into columns.
 
+    What it does not say itself the table of the file says.
+
     Parameters
     ----------
     table : TableFile
@@ -89,10 +90,8 @@ class TopicTable:
     ahead: float | None
     remarks: list[str] = field(default_factory=list)
 
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self.table.path
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.table, name)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -105,44 +104,14 @@ class TopicTable:
         return {**self.table.units, **{m.name: m.unit for m in self.made if m.unit}}
 
     @property
-    def text(self) -> frozenset[str]:
-        """Columns of words."""
-        return self.table.text
-
-    @property
     def dates(self) -> frozenset[str]:
         """Columns in UNIX time [s]."""
         return self.table.dates | {m.name for m in self.made if m.name == STAMP}
 
     @property
-    def clocks(self) -> frozenset[str]:
-        """Columns of times of day."""
-        return self.table.clocks
-
-    @property
     def notes(self) -> list[str]:
         """What was recovered and taken for granted."""
         return [*self.table.notes, *self.remarks]
-
-    @property
-    def format(self) -> str:
-        """Format of the file."""
-        return self.table.format
-
-    @property
-    def first_row(self) -> int:
-        """Number of the first sample's row."""
-        return self.table.first_row
-
-    @property
-    def steps(self) -> tuple[Step, ...]:
-        """What had to be done to read the times."""
-        return self.table.steps
-
-    @property
-    def cells(self) -> int:
-        """How many numbers the table holds at most."""
-        return self.table.cells
 
     @property
     def parts(self) -> dict[str, tuple[str, ...]]:

@@ -18,10 +18,13 @@ from ruamel.yaml.error import YAMLError
 
 from greybox.errors import LogError
 from greybox.trial.readers.limits import limits
-from greybox.trial.readers.ros import database, mcap_file
-from greybox.trial.readers.ros.bag1 import read_bag1
-from greybox.trial.readers.ros.database import read_database
-from greybox.trial.readers.ros.mcap_file import read_mcap
+from greybox.trial.readers.ros.formats import (
+    MCAP_MAGIC,
+    SQLITE_MAGIC,
+    read_bag1,
+    read_database,
+    read_mcap,
+)
 from greybox.trial.readers.ros.storage import (
     Budget,
     CutError,
@@ -150,9 +153,9 @@ def read_messages(
         try:
             if magic.startswith(b"#ROSBAG V"):
                 yield from read_bag1(handle, budget, notes, wanted)
-            elif magic.startswith(mcap_file.MAGIC):
+            elif magic.startswith(MCAP_MAGIC):
                 yield from _counted(read_mcap(handle, budget, notes, wanted), mode, budget, notes)
-            elif magic == database.MAGIC:
+            elif magic == SQLITE_MAGIC:
                 yield from _counted(read_database(path, budget, wanted), mode, budget, notes)
             else:
                 raise LogError(
