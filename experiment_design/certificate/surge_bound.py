@@ -20,7 +20,6 @@ from experiment_design.excitation.rollout import Rollout
 from experiment_design.information.moments import MomentProgram, Moments
 from experiment_design.request.problem import TrialProblem
 from greybox.model.run.simulation import simulate
-from greybox.vessel.force import generalised_force
 
 Array = NDArray[np.float64]
 
@@ -61,12 +60,11 @@ class SurgeBound:
     evaluations: int
 
 
-@dataclass(frozen=True)
-class _Sums:
-    """Extended sums (q, q) of z̃ z̃ᵀ and of the scores, or derivatives in them."""
-
-    gram: Array
-    score_covariance: Array
+def _along(slope: Moments, sums: Moments) -> float:
+    """Return the linear functional of sums that a derivative in them is."""
+    return float(
+        (slope.gram * sums.gram).sum() + (slope.score_covariance * sums.score_covariance).sum()
+    )
 
 
 def why_not_surge(problem: TrialProblem) -> str:
@@ -111,9 +109,7 @@ def bound_surge(problem: TrialProblem, unit: Array, seed: int = 0) -> SurgeBound
     value, mixed, slope, members, _ = found[int(np.argmax(values))]
     evaluations = sum(f[4] for f in found) + 2
     fine = _Programme(trial, 2 * _SPEEDS, 2 * _FORCES - 1)
-    base = float(
-        (slope.gram * mixed.gram).sum() + (slope.score_covariance * mixed.score_covariance).sum()
-    )
+    base = _along(slope, mixed)
     best, rough = fine.maximise(slope)[0], coarse.maximise(slope)[0]
     grid = abs(best - rough)
     gap = max(best, rough) - base
@@ -142,11 +138,7 @@ class _Trial:
 
     def force(self, commands: Array) -> Array:
         """Return the surge force (...) of commands (..., nc)."""
-        names = self.rollout.vessel.commands
-        made = generalised_force(
-            self.rollout.vessel, {n: commands[..., i] for i, n in enumerate(names)}
-        )
-        return np.asarray(made["taux"])
+        return self.rollout.forces(commands)[..., 0]
 
     def _extremes(self) -> tuple[float, float]:
         s = self.problem.schedule
@@ -189,7 +181,7 @@ class _Trial:
         full = np.concatenate([z[:, 0], np.ones_like(flat)])
         return full.T.reshape(*u.shape, -1), a[0, :, 0].reshape(-1, *u.shape)
 
-    def sums(self, forces: Array) -> list[_Sums]:
+    def sums(self, forces: Array) -> list[Moments]:
         """Return the extended sums of sequences of forces (R, K)."""
         tau = np.repeat(forces, self.hold, axis=1)[:, : self.samples]
         u = self.run(np.full(len(tau), self.rollout.start[0]), tau)[:, :-1]
@@ -203,10 +195,10 @@ class _Trial:
             score = self.variance[0] * s @ s.T + self.process * gram
             for c in range(1, len(a)):
                 score += self.variance[c] * (z[i].T * a[c, i] ** 2) @ z[i]
-            out.append(_Sums(gram, score))
+            out.append(Moments(gram, score))
         return out
 
-    def value(self, sums: _Sums) -> tuple[float, _Sums]:
+    def value(self, sums: Moments) -> tuple[float, Moments]:
         """Return the criterion of extended sums, and its derivatives in them."""
         mean = sums.gram[:-1, -1] / sums.gram[-1, -1]
         p = np.hstack([np.eye(mean.size), -mean[:, None]])
@@ -220,7 +212,7 @@ class _Trial:
         gram[:-1, -1] += turn / 2
         gram[-1, :-1] += turn / 2
         gram[-1, -1] -= turn @ mean
-        return value, _Sums(gram, score)
+        return value, Moments(gram, score)
 
 
 class _Programme:
@@ -249,7 +241,7 @@ class _Programme:
             before[:, j] = np.interp(self.u, order, wide)
         self.before = trial.extended(before, np.broadcast_to(self.tau, before.shape))[0]
 
-    def maximise(self, slope: _Sums) -> tuple[float, Array]:
+    def maximise(self, slope: Moments) -> tuple[float, Array]:
         """Return the largest ⟨slope, sums⟩ over all sequences, and its forces (K,)."""
         trial = self.trial
         score = trial.variance[0] * slope.score_covariance
@@ -302,30 +294,21 @@ class _Programme:
 
 def _improve(
     trial: _Trial, programme: _Programme, forces: Array
-) -> tuple[float, _Sums, _Sums, int, int]:
+) -> tuple[float, Moments, Moments, int, int]:
     """Raise the criterion over mixtures of sequences, first those of forces (R, K)."""
     known = trial.sums(forces)
     gram = np.array([s.gram for s in known])
     score = np.array([s.score_covariance for s in known])
     weights = np.full(len(known), 1.0 / len(known))
     for step in range(_STEPS):
-        mixed = _Sums(np.tensordot(weights, gram, 1), np.tensordot(weights, score, 1))
+        mixed = Moments(np.tensordot(weights, gram, 1), np.tensordot(weights, score, 1))
         value, slope = trial.value(mixed)
         best, sequence = programme.maximise(slope)
-        base = float(
-            (slope.gram * mixed.gram).sum()
-            + (slope.score_covariance * mixed.score_covariance).sum()
-        )
+        base = _along(slope, mixed)
         if best - base < _ENOUGH or step == _STEPS - 1:
             break
         more = trial.sums(sequence[None])[0]
-        gain = (
-            float(
-                (slope.gram * more.gram).sum()
-                + (slope.score_covariance * more.score_covariance).sum()
-            )
-            - base
-        )
+        gain = _along(slope, more) - base
         if gain <= _ENOUGH / 4:
             break
         gram = np.concatenate([gram, more.gram[None]])
@@ -340,7 +323,7 @@ def _weights(trial: _Trial, gram: Array, score: Array, weights: Array) -> Array:
     """Return weights of sums (n, q, q) that maximise the criterion from given ones."""
 
     def worth(parts: list[Array]) -> tuple[float, list[Array]]:
-        mixed = _Sums(np.tensordot(parts[0], gram, 1), np.tensordot(parts[0], score, 1))
+        mixed = Moments(np.tensordot(parts[0], gram, 1), np.tensordot(parts[0], score, 1))
         value, slope = trial.value(mixed)
         along = np.einsum("ij,rij->r", slope.gram, gram)
         return value, [along + np.einsum("ij,rij->r", slope.score_covariance, score)]

@@ -46,7 +46,6 @@ from experiment_design.information.moments import MomentProgram, Moments
 from experiment_design.optimise.search import draw_two_level
 from experiment_design.request.problem import TrialProblem
 from greybox.model.run.simulation import simulate
-from greybox.vessel.force import generalised_force
 
 Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
@@ -333,21 +332,12 @@ class _Trial:
             levels_of = np.array(list(product(np.linspace(0, 1, levels), repeat=len(s.commands))))
         else:
             levels_of = rng.integers(0, 2, (_COMBINATIONS, len(s.commands))).astype(float)
-        self.candidates = self.forces(problem.levels(levels_of))
+        self.candidates = self.rollout.forces(problem.levels(levels_of))
         kept = draw_two_level(problem, rng, _DRAWS)
         self.first = self._run_whole(np.concatenate([unit[None], kept]))
         self._scale(self.first[0])
         self.known = self.sums(*self.first)
         self.low, self.high = self._reach()
-
-    def forces(self, commands: Array) -> Array:
-        """Return the generalised inputs (..., nu) of commands (..., nc)."""
-        names = self.rollout.vessel.commands
-        made = generalised_force(
-            self.rollout.vessel, {n: commands[..., i] for i, n in enumerate(names)}
-        )
-        none = np.zeros(commands.shape[:-1])
-        return np.stack([made.get(n, none) for n in self.rollout.structure.inputs], axis=-1)
 
     def _run_whole(self, units: Array) -> tuple[Array, Array, Array]:
         motion = self.rollout.run(self.problem.commands(units))

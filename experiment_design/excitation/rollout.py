@@ -126,15 +126,7 @@ class Rollout:
         return self._run(thetas, together, late)
 
     def _run(self, theta: Array, commands: Array, late: bool) -> Motion:
-        structure = self.structure
-        columns = {n: commands[..., i] for i, n in enumerate(self.vessel.commands)}
-        if late:
-            made = actuated_force(self.vessel, columns, self.sample_time)
-        else:
-            made = generalised_force(self.vessel, columns)
-        tau = np.stack(
-            [made.get(n, np.zeros(commands.shape[:2])) for n in structure.inputs], axis=-1
-        )
+        structure, tau = self.structure, self.forces(commands, late=late)
         samples = commands.shape[1]
         heading = None if "r" in structure.states else np.full(samples + 1, self.start[-1])
         free = simulate(
@@ -149,6 +141,16 @@ class Rollout:
             state = self._with_way(free.x, free.psi)
         state[~stable] = 0.0
         return Motion(state, tau, commands, stable)
+
+    def forces(self, commands: Array, *, late: bool = False) -> Array:
+        """Return generalised inputs (..., nu) of commands (..., nc), `late` with lag and delay."""
+        columns = {n: commands[..., i] for i, n in enumerate(self.vessel.commands)}
+        if late:
+            made = actuated_force(self.vessel, columns, self.sample_time)
+        else:
+            made = generalised_force(self.vessel, columns)
+        none = np.zeros(commands.shape[:-1])
+        return np.stack([made.get(n, none) for n in self.structure.inputs], axis=-1)
 
     def moved(self, motion: Motion, by: Array) -> Motion:
         """Return R runs whose states are off (R, N+1, nx), heading and place as they follow."""
@@ -192,18 +194,8 @@ class Rollout:
         ndarray
             (N, nc) total derivative.
         """
-        state, commands = motion.state[0], motion.commands[0]
-        samples, n = len(commands), state.shape[1]
-        in_state, in_command, force = self._derivatives(state[:-1], commands)
-        # costates p(k) = g(k) + Fᵀ(k) p(k+1): one upper banded system
-        band = np.zeros((2 * n, n * (samples + 1)))
-        band[-1] = 1.0
-        for a in range(n):
-            for b in range(n):
-                band[n - 1 + a - b, n + b :: n] = -in_state[b, a]
-        costate = solve_banded(
-            (0, 2 * n - 1), band, d_state.ravel(), check_finite=False, overwrite_ab=True
-        ).reshape(samples + 1, n)
+        in_state, in_command, force = self._derivatives(motion.state[0, :-1], motion.commands[0])
+        costate = costates(in_state, d_state[..., None])[..., 0]
         return np.asarray(
             d_commands
             + np.einsum("ian,ni->na", force, d_tau)
@@ -225,6 +217,30 @@ class Rollout:
             blocks.append(out[first : first + rows * columns].reshape(rows, columns, *shape))
             first += rows * columns
         return blocks
+
+
+def costates(slopes: Array, seed: Array) -> Array:
+    """Return p(k) = seed(k) + Fᵀ(k) p(k+1), (N+1, n, m), as one upper banded system.
+
+    Parameters
+    ----------
+    slopes : ndarray
+        (n, n, N) F, the derivatives of the next state in the state.
+    seed : ndarray
+        (N+1, n, m)
+    """
+    n = len(slopes)
+    band = np.zeros((2 * n, n * len(seed)))
+    band[-1] = 1.0
+    for i in range(n):
+        for j in range(n):
+            # row kn + i, column (k+1)n + j
+            band[n - 1 + i - j, n + j :: n] = -slopes[j, i]
+    solved = solve_banded(
+        (0, 2 * n - 1), band, seed.reshape(n * len(seed), -1),
+        overwrite_ab=True, check_finite=False,
+    )  # fmt: skip
+    return np.asarray(solved.reshape(seed.shape))
 
 
 def plausible_bounds(states: tuple[str, ...]) -> Array:

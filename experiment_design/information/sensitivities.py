@@ -24,8 +24,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_banded
 
+from experiment_design.excitation.rollout import costates
 from experiment_design.information.moments import Moments, measured_air
 from greybox.errors import UsageError
 from greybox.model.noise import NoiseLevels
@@ -180,21 +180,6 @@ class SensitivityProgram:
         start = np.tile(self.first, (runs, 1, 1))
         return propagate(np.ascontiguousarray(a.transpose(2, 3, 0, 1)), driven, start)
 
-    def _adjoint(self, a: Array, seed: Array) -> Array:
-        """Return Λ(k) = seed(k) + Aᵀ(k) Λ(k+1), (N+1, n, columns)."""
-        n, samples = self.size, a.shape[-1]
-        band = np.zeros((2 * n, n * (samples + 1)))
-        band[-1] = 1.0
-        for i in range(n):
-            for j in range(n):
-                # row kn + i, column (k+1)n + j
-                band[n - 1 + i - j, n + j :: n] = -a[j, i]
-        solved = solve_banded(
-            (0, 2 * n - 1), band, seed.reshape(n * (samples + 1), -1),
-            overwrite_ab=True, check_finite=False,
-        )  # fmt: skip
-        return np.asarray(solved.reshape(samples + 1, n, -1))
-
     def sensitivities(self, x: Array, psi: Array, tau: Array) -> Array:
         """Return S of R sequences, (R, N+1, n, columns); see `__call__`.
 
@@ -244,7 +229,7 @@ class SensitivityProgram:
         a = a[:, :, 0]
         back_to = np.argsort(self.order)
         d_f = (d_gram + d_score)[np.ix_(back_to, back_to)]
-        costate = self._adjoint(a, 2.0 * self.weight[:, None] * (s @ d_f))[1:]
+        costate = costates(a, 2.0 * self.weight[:, None] * (s @ d_f))[1:]
         samples, n = a.shape[-1], self.size
         d_a = costate @ s[:-1].transpose(0, 2, 1)
         d_b = costate[..., : self._driven]

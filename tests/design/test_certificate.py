@@ -16,14 +16,14 @@ from experiment_design.certificate.certificate import (
     _Tangent,
     certify,
 )
-from experiment_design.certificate.surge_bound import _Programme, _Sums, _Trial, why_not_surge
+from experiment_design.certificate.surge_bound import _Programme, _Trial, why_not_surge
 from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TrialLimits
 from experiment_design.criteria.covariance import Criterion
 from experiment_design.design import design_trial
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.excitation.schedule import make_schedule
-from experiment_design.information.moments import MomentProgram
+from experiment_design.information.moments import MomentProgram, Moments
 from experiment_design.optimise.search import ascend, climb, draw_two_level
 from experiment_design.request.problem import Scenario, TrialProblem
 from greybox.model.catalogue import get_structure
@@ -164,7 +164,7 @@ def test_dynamic_programme_equals_all_sequences(ship):
     for i in (100, 2000):
         _, slope = trial.value(sums[i])
         noisy = slope.gram * (1 + 0.2 * rng.random((4, 4)))
-        slope = _Sums((noisy + noisy.T) / 2, slope.score_covariance)
+        slope = Moments((noisy + noisy.T) / 2, slope.score_covariance)
         values = [
             (slope.gram * s.gram).sum() + (slope.score_covariance * s.score_covariance).sum()
             for s in sums
