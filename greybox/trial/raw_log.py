@@ -53,6 +53,11 @@ class Signal:
     def __repr__(self) -> str:
         return f"<Signal: {self.name} [{self.unit or 'no unit'}], {len(self)} values>"
 
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which samples have a time and a value that are numbers, (N,)."""
+        return np.isfinite(self.t) & np.isfinite(self.value)
+
     def with_value(self, value: Array) -> Signal:
         """Return the signal with other values on the same clock."""
         return replace(self, value=value)

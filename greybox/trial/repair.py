@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from greybox.errors import LogError, UsageError, suggestion
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import IDS, CheckReport, Finding
-from greybox.trial.convert.derived_signals import continuous, derive_signals
+from greybox.trial.checks.signal_quality import clean
+from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import Step, mend
 from greybox.trial.time_format import unpadded_numbers
@@ -130,7 +131,7 @@ def _beside(recording: Recording) -> dict[str, int]:
     """Return how many samples of each channel lie within the time that all channels cover."""
     clocks = {}
     for s in recording.signals:
-        t = s.t[np.isfinite(s.t) & np.isfinite(s.value)]
+        t = s.t[s.known]
         if len(t):
             clocks[s.name] = t
     if not clocks:
@@ -158,20 +159,26 @@ def apply_repairs(recording: Recording, findings: Iterable[Finding]) -> Recordin
     return recording.with_steps(*steps)
 
 
+def _changed(
+    recording: Recording, names: Collection[str], change: Callable[[Signal], Signal]
+) -> Recording:
+    """Return the recording with some of its signals changed."""
+    return recording.with_signals(change(s) if s.name in names else s for s in recording.signals)
+
+
 def _order(recording: Recording, step: Step) -> Recording:
     clocks: dict[int, tuple[NDArray[np.int64], Array]] = {}
-    out = []
-    for s in recording.signals:
-        if s.name in step.channels:
-            if id(s.t) not in clocks:
-                order = np.argsort(s.t, kind="stable")
-                t = s.t[order]
-                once = np.concatenate([[True], np.diff(t) != 0])
-                clocks[id(s.t)] = (order[once], t[once])
-            rows, t = clocks[id(s.t)]
-            s = replace(s, t=t, value=s.value[rows])
-        out.append(s)
-    return recording.with_signals(out)
+
+    def in_order(s: Signal) -> Signal:
+        if id(s.t) not in clocks:
+            order = np.argsort(s.t, kind="stable")
+            t = s.t[order]
+            once = np.concatenate([[True], np.diff(t) != 0])
+            clocks[id(s.t)] = (order[once], t[once])
+        rows, t = clocks[id(s.t)]
+        return replace(s, t=t, value=s.value[rows])
+
+    return _changed(recording, step.channels, in_order)
 
 
 def _cut(recording: Recording, step: Step) -> Recording:
@@ -188,67 +195,60 @@ def _signals_of(recording: Recording, step: Step) -> set[str]:
 
 
 def _interpolate(recording: Recording, step: Step) -> Recording:
-    names, times = _signals_of(recording, step), np.array(step.numbers("times"))
-    out = []
-    for s in recording.signals:
-        if s.name in names:
-            bad = np.isin(s.t, times)
-            good = np.isfinite(s.value) & np.isfinite(s.t) & ~bad
-            if bad.any() and good.any():
-                value = s.value.copy()
-                value[bad] = np.interp(s.t[bad], s.t[good], s.value[good])
-                s = s.with_value(value)
-        out.append(s)
-    return recording.with_signals(out)
+    times = np.array(step.numbers("times"))
+
+    def bridged(s: Signal) -> Signal:
+        bad = np.isin(s.t, times)
+        good = s.known & ~bad
+        if not (bad.any() and good.any()):
+            return s
+        value = s.value.copy()
+        value[bad] = np.interp(s.t[bad], s.t[good], s.value[good])
+        return s.with_value(value)
+
+    return _changed(recording, _signals_of(recording, step), bridged)
 
 
 def _drop(recording: Recording, step: Step) -> Recording:
-    out = []
-    names = _signals_of(recording, step)
     times = np.array(step.numbers("times"))
     shared: dict[tuple[int, bytes], Array] = {}
-    for s in recording.signals:
-        if s.name in names:
-            keep = np.isfinite(s.value) & np.isfinite(s.t)
-            if len(times):
-                keep &= ~np.isin(s.t, times)
-            if step.interval is not None:
-                keep &= (s.t < step.interval[0]) | (s.t > step.interval[1])
-            # signals that keep the same rows keep sharing one clock
-            t = shared.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
-            s = replace(s, t=t, value=s.value[keep])
-        out.append(s)
-    return recording.with_signals(out)
+
+    def without(s: Signal) -> Signal:
+        keep = s.known
+        if len(times):
+            keep &= ~np.isin(s.t, times)
+        if step.interval is not None:
+            keep &= (s.t < step.interval[0]) | (s.t > step.interval[1])
+        # signals that keep the same rows keep sharing one clock
+        t = shared.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
+        return replace(s, t=t, value=s.value[keep])
+
+    return _changed(recording, _signals_of(recording, step), without)
 
 
 def _pad_fractions(recording: Recording, step: Step) -> Recording:
     zero = recording.epoch or 0.0
     shared: dict[int, Array] = {}
-    out = []
-    for s in recording.signals:
-        if s.name in step.channels:
-            if id(s.t) not in shared:
-                wrong = unpadded_numbers(s.t + zero)
-                t = s.t.copy()
-                t[wrong.rows] = wrong.times - zero
-                shared[id(s.t)] = t
-            s = replace(s, t=shared[id(s.t)])
-        out.append(s)
-    return recording.with_signals(out)
+
+    def padded(s: Signal) -> Signal:
+        if id(s.t) not in shared:
+            wrong = unpadded_numbers(s.t + zero)
+            t = s.t.copy()
+            t[wrong.rows] = wrong.times - zero
+            shared[id(s.t)] = t
+        return replace(s, t=shared[id(s.t)])
+
+    return _changed(recording, step.channels, padded)
 
 
 def _scale(recording: Recording, step: Step) -> Recording:
-    return recording.with_signals(
-        s.with_value(s.value * step.number("factor")) if s.name in step.channels else s
-        for s in recording.signals
-    )
+    factor = step.number("factor")
+    return _changed(recording, step.channels, lambda s: s.with_value(s.value * factor))
 
 
 def _offset(recording: Recording, step: Step) -> Recording:
-    return recording.with_signals(
-        s.with_value(s.value + step.number("offset")) if s.name in step.channels else s
-        for s in recording.signals
-    )
+    offset = step.number("offset")
+    return _changed(recording, step.channels, lambda s: s.with_value(s.value + offset))
 
 
 def _exchange(recording: Recording, step: Step) -> Recording:
@@ -261,12 +261,11 @@ def _exchange(recording: Recording, step: Step) -> Recording:
 def _shift(recording: Recording, step: Step) -> Recording:
     late = step.number("late")
     shared: dict[int, Array] = {}
-    out = []
-    for s in recording.signals:
-        if s.name in step.channels:
-            s = replace(s, t=shared.setdefault(id(s.t), s.t - late))
-        out.append(s)
-    return recording.with_signals(out)
+    return _changed(
+        recording,
+        step.channels,
+        lambda s: replace(s, t=shared.setdefault(id(s.t), s.t - late)),
+    )
 
 
 def _turn_heading(recording: Recording, step: Step) -> Recording:
@@ -278,27 +277,19 @@ def _earth_to_body(recording: Recording, step: Step) -> Recording:
     psi = _heading_at(recording, north.t)
     u, v = ned_to_body(north.value, np.interp(north.t, east.t, east.value), psi)
     made = {"u": u, "v": v}
-    return recording.with_signals(
-        replace(x, t=north.t, value=made[x.name]) if x.name in made else x
-        for x in recording.signals
-    )
+    return _changed(recording, made, lambda s: replace(s, t=north.t, value=made[s.name]))
 
 
 def _move_antenna(recording: Recording, step: Step) -> Recording:
-    x, y = step.number("x"), step.number("y")
-    out: list[Signal] = []
-    for s in recording.signals:
-        if s.name in ("x_n", "y_n"):
-            arm = body_to_ned(x, y, _heading_at(recording, s.t))
-            s = s.with_value(s.value - arm[s.name == "y_n"])
-        out.append(s)
-    return recording.with_signals(out)
+    def at_origin(s: Signal) -> Signal:
+        arm = body_to_ned(step.number("x"), step.number("y"), _heading_at(recording, s.t))
+        return s.with_value(s.value - arm[s.name == "y_n"])
+
+    return _changed(recording, ("x_n", "y_n"), at_origin)
 
 
 def _heading_at(recording: Recording, t: Array) -> Array:
-    psi = recording["psi"]
-    keep = np.isfinite(psi.value) & np.isfinite(psi.t)
-    return np.interp(t, psi.t[keep], continuous(psi.value[keep]))
+    return np.interp(t, *clean(recording["psi"]))
 
 
 # what a channel is derived from, where a recording does not hold it yet

@@ -30,9 +30,9 @@ from greybox.trial.checks.signal_quality import (
     spike_findings,
     stuck_findings,
     time_findings,
+    time_format_findings,
 )
 from greybox.trial.checks.thruster_response import answer_findings
-from greybox.trial.checks.time_format import time_format_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.channel_mapping import read_recording
 from greybox.trial.convert.deduplicate import first_run

@@ -33,7 +33,7 @@ from greybox.numerics.recursion import decay
 from greybox.numerics.robust import robust_deviation
 from greybox.rotation import ned_to_body
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.checks.motion import Motion, denoise, make_motion
+from greybox.trial.checks.motion import Motion, denoise, make_motion, orderly, slope
 from greybox.trial.convert.resample import clock as make_clock
 from greybox.trial.convert.resample import hold_mean
 from greybox.trial.gaps import runs
@@ -183,15 +183,13 @@ def _read(recording: Recording, vessel: Vessel) -> _Read | str:
         values["u"], values["v"] = ned_to_body(motion["v_n"], motion["v_e"], motion["psi"])
     # of slow turning the heading tells more than a rate gyro, whose noise adds up
     values["psi"] = denoise(motion["psi"], motion)
-    values["r"] = _slope(values["psi"], motion)
+    values["r"] = slope(values["psi"], motion)
     commands = {}
     for c in vessel.commands:
-        signal = recording[c]
-        keep = np.isfinite(signal.value) & np.isfinite(signal.t)
-        t, first = np.unique(signal.t[keep], return_index=True)
-        if not len(t):
+        s = orderly(recording[c], angular=False)
+        if not len(s):
             return f"the log has no value of {c}"
-        commands[c] = hold_mean(make_clock(t), signal.value[keep][first], motion.t, motion.step)
+        commands[c] = hold_mean(make_clock(s.t), s.value, motion.t, motion.step)
     return _Read(replace(motion, values=values), commands)
 
 
@@ -211,10 +209,6 @@ def _drifted(x: _Read, current: Array) -> _Read:
     along, across = ned_to_body(float(current[0]), float(current[1]), motion["psi"])
     values = motion.values | {"u": motion["u"] - along, "v": motion["v"] - across}
     return replace(x, motion=replace(motion, values=values))
-
-
-def _slope(value: Array, motion: Motion) -> Array:
-    return np.concatenate([np.gradient(value[a:b], motion.step) for a, b in motion.stretches])
 
 
 def _mean_after(value: Array, motion: Motion) -> Array:
@@ -250,7 +244,7 @@ def _terms(x: _Read, vessel: Vessel) -> tuple[NDArray[np.int64], Array]:
         ahead = name in ("taux", "race_drag", "rudder_drag")
         bent = f * bend if name.startswith("rudder") else f * np.abs(f)
         (along if ahead else across).append(f)
-        (fine if ahead else fine_across).extend((f * ahead_mean, bent, _slope(f, motion)))
+        (fine if ahead else fine_across).extend((f * ahead_mean, bent, slope(f, motion)))
     for thruster in vessel.thrusters:
         own = {c: x.commands[c] for c in thruster.columns}
         force = generalised_force(replace(vessel, thrusters=(thruster,)), own)

@@ -95,6 +95,26 @@ class Finding(DisplayMixin):
         }
 
 
+def exact_finding(
+    id: str,
+    channels: tuple[str, ...],
+    value: float,
+    unit: str,
+    evidence: str,
+    fix: str,
+    repair: tuple[Step, ...] = (),
+    safe: bool = False,
+    picture: Mapping[str, Any] | None = None,
+    logs: tuple[str, ...] = (),
+) -> Finding:
+    """Return a finding whose size is counted or known, so that its interval is one number."""
+    interval = (value, value)
+    return Finding(
+        id, channels[0], value, interval, unit, evidence, fix, channels, repair, safe,
+        picture or {}, logs,
+    )  # fmt: skip
+
+
 def declare_unit(names: Sequence[str], unit: str) -> str:
     """Return how to declare the unit that columns are in, or to convert them."""
     entries = " and ".join(f'"{n}" = {{ name = "{n}", unit = "{unit}" }}' for n in names)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from greybox.rotation import ned_to_body
 from greybox.trial.checks.course import PLAUSIBLE, Course, course_scatter
-from greybox.trial.checks.finding import Finding, Outcome, declare_unit
+from greybox.trial.checks.finding import Finding, Outcome, declare_unit, exact_finding
 from greybox.trial.checks.motion import Motion, integrate, profiles, read_together, to_ned
 from greybox.trial.checks.wind_convention import STEADIER
 from greybox.trial.convert.derived_signals import continuous
@@ -398,16 +398,14 @@ def reading_findings(reading: ColumnReading, names: Sequence[str] = ()) -> list[
         )
         beside = f" in {len(reading.logs)} logs together" if several else ""
         found.append(
-            Finding(
+            exact_finding(
                 c.id,
-                c.channels[0],
+                c.channels,
                 c.value,
-                (c.value, c.value),
                 c.unit,
                 f"{c.words}: only then do {tied} agree (log-likelihood higher by "
                 f"{reading.gain:.0f}{beside}){reading.remark}",
                 c.fix if reading.sure else c.fix.replace("--fix", f"--fix-also {c.id}", 1),
-                c.channels,
                 c.repair,
                 reading.sure,
                 {"changes": reading.changes},

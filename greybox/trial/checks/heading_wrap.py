@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.numerics.robust import robust_deviation
-from greybox.trial.checks.finding import Finding
+from greybox.trial.checks.finding import Finding, exact_finding
 from greybox.trial.checks.signal_quality import quantum
 from greybox.trial.convert.derived_signals import usual_reach
 from greybox.trial.raw_log import Recording
@@ -49,7 +49,7 @@ def wrap_findings(recording: Recording) -> list[Finding]:
     if "psi" not in recording:
         return []
     s = recording["psi"]
-    keep = np.isfinite(s.value) & np.isfinite(s.t)
+    keep = s.known
     t, value = s.t[keep], s.value[keep]
     if len(value) < 10:
         return []
@@ -63,11 +63,10 @@ def wrap_findings(recording: Recording) -> list[Finding]:
     a, b, c = np.degrees(value[[before, k, after]] * (2 * np.pi / whole))
     count = float(len(between))
     return [
-        Finding(
+        exact_finding(
             "heading_wrap",
-            "psi",
+            ("psi",),
             count,
-            (count, count),
             "1",
             f"{len(between)} sample{'s' if len(between) > 1 else ''} of psi "
             f"lie{'' if len(between) > 1 else 's'} between the two sides of the compass's wrap, "
@@ -75,7 +74,6 @@ def wrap_findings(recording: Recording) -> list[Finding]:
             f"as when a heading is interpolated before it is unwrapped",
             "leave those samples out (import --fix does; what is missing is bridged where one "
             "sample is, else a gap), or resample the heading again after unwrapping it",
-            ("psi",),
             (mend("drop", ("psi",), times=tuple(float(x) for x in t[between])),),
             True,
             {"t": t, "value": value, "between": between, "turn": whole},

@@ -159,7 +159,7 @@ def end_to_end(
 
 def orderly(s: Signal, *, angular: bool) -> Signal:
     """Return a signal in the order of its times, each once and finite; an angle continuous."""
-    keep = np.isfinite(s.value) & np.isfinite(s.t)
+    keep = s.known
     t, once = np.unique(s.t[keep], return_index=True)
     value = s.value[keep][once]
     return Signal(s.name, t, continuous(value) if angular else value, s.unit)
@@ -201,6 +201,11 @@ def integrate(rate: Array, motion: Motion) -> Array:
             steps[1:-1] = (13 * (f[1:-2] + f[2:-1]) - f[:-3] - f[3:]) / 24
         out[a + 1 : b] = h * np.cumsum(steps, axis=0)
     return out
+
+
+def slope(value: Array, motion: Motion) -> Array:
+    """Return the rate of change of a channel by central differences within each stretch."""
+    return np.concatenate([np.gradient(value[a:b], motion.step) for a, b in motion.stretches])
 
 
 def whiten(z: Array, gain: float, motion: Motion) -> Array:

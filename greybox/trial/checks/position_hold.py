@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.numerics.robust import robust_deviation
-from greybox.trial.checks.finding import Finding
+from greybox.trial.checks.finding import Finding, exact_finding
 from greybox.trial.checks.signal_quality import (
     STUCK_SAMPLES,
     STUCK_SECONDS,
@@ -117,18 +117,16 @@ def hold_findings(recording: Recording) -> list[Finding]:
     count = float(len(rows))
     several = len(rows) > 1
     return [
-        Finding(
+        exact_finding(
             "position_hold",
-            "x_n",
+            ("x_n", "y_n"),
             count,
-            (count, count),
             "1",
             f"{len(rows)} position{'s' if several else ''} repeat{'' if several else 's'} the one "
             f"before to the last digit under way, the first at t = {t[rows[0]]:.6g} s, most in a "
             f"row {longest[1]} at t = {t[longest[0]]:.6g} s, where the ship went "
             f"{missed:.3g} m meanwhile: the receiver's messages came late",
             "interpolate those samples between their neighbours (import --fix does)",
-            ("x_n", "y_n"),
             (mend("interpolate", ("x_n", "y_n"), times=tuple(float(x) for x in t[rows])),),
             True,
             {

@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 from greybox.channels import ANGLES
 from greybox.numerics.robust import FROM_MEDIAN, robust_deviation
 from greybox.rotation import body_to_ned
-from greybox.trial.checks.finding import Finding, declare_unit
+from greybox.trial.checks.finding import Finding, declare_unit, exact_finding
 from greybox.trial.convert.channel_mapping import beyond_reach
 from greybox.trial.convert.deduplicate import CUT_RUNS, second_run
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock
 from greybox.trial.gaps import GAP, HOLE, runs, usual_step
 from greybox.trial.raw_log import Recording, Signal
-from greybox.trial.steps import mend
+from greybox.trial.steps import Step, mend
+from greybox.trial.time_format import unpadded_numbers
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -84,16 +85,14 @@ def time_findings(recording: Recording) -> list[Finding]:
                 )
                 fix, finite = CUT_RUNS, finite[:k]
             found.append(
-                Finding(
+                exact_finding(
                     "duplicate_time",
-                    "t",
+                    ("t",),
                     float(count),
-                    (float(count), float(count)),
                     "1",
                     f"of the {len(steps) + 1} times of {listed(names)} {' and '.join(what)}, "
                     f"{where}",
                     fix,
-                    ("t",),
                     (mend("order", names),) if second is None else (),
                     second is None,
                     {"t": t[np.isfinite(t)], "steps": steps, "names": names},
@@ -120,20 +119,16 @@ def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
     longest = int(wide[np.argmax(steps[wide])])
     size = float(steps[longest])
     return [
-        Finding(
+        exact_finding(
             "gap",
-            "t",
+            ("t",),
             size,
-            (size, size),
             "s",
             f"{len(wide)} hole{'s' if len(wide) > 1 else ''} in {listed(names)}: no value for more "
             f"than {HOLE:g} usual steps of {usual:.4g} s; the longest hole lasts {size:.4g} s from "
             f"t = {t[longest]:.6g} s",
             "none needed: import keeps gaps as gaps, and each stretch becomes a segment",
-            ("t",),
-            (),
-            False,
-            {
+            picture={
                 "t": t,
                 "gaps": [(float(t[k]), float(t[k + 1])) for k in wide[:200]],
                 "names": names,
@@ -169,16 +164,14 @@ def missing_findings(recording: Recording) -> list[Finding]:
         )
         count = float(bad.sum())
         found.append(
-            Finding(
+            exact_finding(
                 "nan",
-                names[0],
+                names,
                 count,
-                (count, count),
                 "1",
                 f"{int(count)} of {n} samples of {listed(names)} hold no number, in "
                 f"{len(stretches)} stretch{'es' if len(stretches) > 1 else ''}, {where}",
                 "leave them out: import does, and keeps longer stretches as gaps",
-                names,
                 (mend("drop", names),),
                 True,
                 {"t": t, "bad": bad},
@@ -353,19 +346,15 @@ def _rounded_finding(
     """Return the finding; `per` is the unit in which the digits were counted."""
     largest = float(np.abs(value).max())
     step = per * float(10.0 ** (np.floor(np.log10(largest / per)) + 1 - digits))
-    return Finding(
+    return exact_finding(
         "quantised",
-        name,
+        (name,),
         step,
-        (step, step),
         unit,
         f"{name} was written with {digits} significant digits: at {largest:.4g} {unit} it moves in "
         f"steps of {step:.3g} {unit}",
         "export it again with all its digits; what depends on fine differences of it is lost",
-        (name,),
-        (),
-        False,
-        {"t": t, "value": value},
+        picture={"t": t, "value": value},
     )
 
 
@@ -407,20 +396,16 @@ def coarse_findings(recording: Recording) -> list[Finding]:
         if not matters and (still < 0.5 or single < 0.5):
             continue
         found.append(
-            Finding(
+            exact_finding(
                 "quantised",
-                s.name,
+                (s.name,),
                 step,
-                (step, step),
                 s.unit or "1",
                 f"{s.name} moves in steps of {step:.4g} {s.unit}, where its own noise is "
                 f"{noise:.2g} {s.unit}, and repeats itself in {100 * still:.0f} % of the samples",
                 "record it with more digits; until then use a longer sample time, and expect "
                 f"an error of {step / np.sqrt(12):.2g} {s.unit} (standard deviation)",
-                (s.name,),
-                (),
-                False,
-                {"t": t, "value": value, "step": step},
+                picture={"t": t, "value": value, "step": step},
             )
         )
     return found
@@ -428,7 +413,7 @@ def coarse_findings(recording: Recording) -> list[Finding]:
 
 def _wrapped(s: Signal) -> Array:
     """Return the values as they were written: digits count in degrees, not in radians."""
-    value = s.value[np.isfinite(s.value) & np.isfinite(s.t)]
+    value = s.value[s.known]
     degrees = np.degrees(value)
     if s.name in ANGLES | {"r"} and significant_digits(degrees):
         return np.asarray(degrees)
@@ -483,16 +468,14 @@ def stuck_findings(recording: Recording) -> list[Finding]:
         if not _moves(s.name, t[a], t[b - 1], signals, quantum(value)):
             continue
         found.append(
-            Finding(
+            exact_finding(
                 "stuck",
-                s.name,
+                (s.name,),
                 span,
-                (span, span),
                 "s",
                 f"{s.name} stays at {value[a]:.6g} {s.unit} for {span:.4g} s from "
                 f"t = {t[a]:.6g} s ({b - a} samples), while the other channels move",
                 "leave that stretch out (import --fix makes it a gap) and look at the sensor",
-                (s.name,),
                 (mend("drop", (s.name,), times=tuple(float(x) for x in t[a + 1 : b])),),
                 True,
                 {"t": t, "value": value, "stretch": (float(t[a]), float(t[b - 1]))},
@@ -551,16 +534,14 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
                 else f"above the {limit:.3g} rad that it can reach"
             )
             found.append(
-                Finding(
+                exact_finding(
                     "unit",
-                    s.name,
+                    (s.name,),
                     180 / np.pi,
-                    (180 / np.pi, 180 / np.pi),
                     "deg per rad",
                     f"{s.name} reaches {largest:.4g}, {why}: it holds degrees where a log has "
                     f"radians",
                     declare_unit((s.name,), "deg"),
-                    (s.name,),
                     (mend("scale", (s.name,), factor=factor),),
                     True,
                     {"t": s.t, "value": s.value, "limit": float(limit)},
@@ -575,7 +556,7 @@ def _motion(recording: Recording) -> Iterable[Signal]:
 
 def clean(s: Signal) -> tuple[Array, Array]:
     """Return times and values where both are numbers, headings unwrapped."""
-    keep = np.isfinite(s.value) & np.isfinite(s.t)
+    keep = s.known
     t, value = (s.t, s.value) if keep.all() else (s.t[keep], s.value[keep])
     if s.name == "psi":
         value = continuous(value)
@@ -596,3 +577,74 @@ def listed(names: Iterable[str]) -> str:
     if len(names) > 4:
         return f"{', '.join(names[:3])} and {len(names) - 3} more"
     return ", ".join(names)
+
+
+def time_format_findings(recording: Recording) -> list[Finding]:
+    """Find times whose fraction of a second was written without its leading zeros.
+
+    Parameters
+    ----------
+    recording : Recording
+        Canonical signals.
+
+    Returns
+    -------
+    list of Finding
+        One for all columns of text that were read so, and one for each clock of numbers.
+    """
+    read = [s for s in recording.steps if s.operation == "pad_fractions" and s.numbers("times")]
+    found = [_padded_text(read)] if read else []
+    for names, t in clocks(recording):
+        zero = recording.epoch or 0.0
+        wrong = unpadded_numbers(t + zero)
+        if not len(wrong):
+            continue
+        meant = wrong.times - zero
+        written = t[wrong.rows]
+        worst = int(np.argmax(written - meant))
+        found.append(
+            exact_finding(
+                "time_format",
+                ("t",),
+                float(len(wrong)),
+                "1",
+                f"{len(wrong)} of {len(t)} times of {listed(names)} lack leading zeros in their "
+                f"fraction of a second, the first at t = {meant[0]:.6g} s, written as "
+                f"{written[0]:.6g} s; they come up to {written[worst] - meant[worst]:.3g} s late "
+                f"and seem to go back behind",
+                "put the zeros before the fractions again (import --fix does)",
+                (_padding(names, len(wrong), float(written[0]), float(meant[0])),),
+                True,
+                {"t": t, "rows": wrong.rows, "written": written, "meant": meant, "names": names},
+            )
+        )
+    return found
+
+
+def _padding(names: tuple[str, ...], count: int, written: float, meant: float) -> Step:
+    said = {"written": f"{written:.9g} s", "meant": f"{meant:.9g} s"}
+    return mend("pad_fractions", names, count=float(count), **said)
+
+
+def _padded_text(read: list[Step]) -> Finding:
+    """Return the finding of columns of text that were read as meant; their steps tell where."""
+    count = sum(s.number("count") for s in read)
+    times = np.array([t for s in read for t in s.numbers("times")])
+    late = np.array([t for s in read for t in s.numbers("late")])
+    columns = listed(x for s in read for x in s.source)
+    first, worst = read[0], int(np.argmax(late))
+    said = first.parameters
+    return exact_finding(
+        "time_format",
+        ("t",),
+        count,
+        "1",
+        f"{count:.0f} times of {columns} have fewer digits than the others, such as "
+        f"{said.get('written')} for {said.get('meant')} at t = {times[0]:.6g} s: "
+        f"their fraction lacks its leading zeros, and would come up to {late[worst]:.3g} s late",
+        "none needed: import reads them as they are meant; export times with all their digits",
+        # the times are right already: to pad them again changes nothing
+        tuple(read),
+        True,
+        {"t": times, "meant": times, "written": times + late, "names": first.source},
+    )

@@ -7,7 +7,7 @@ only where that explains the motion far better than the columns as they are.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.checks.finding import Finding
+from greybox.trial.checks.finding import Finding, exact_finding
 from greybox.trial.checks.motion import (
     Motion,
     Profile,
@@ -25,6 +25,7 @@ from greybox.trial.checks.motion import (
     make_motion,
     profile,
     read_together,
+    slope,
     solve,
     whiten,
     without_starts,
@@ -107,7 +108,7 @@ def answer_findings(
         Log by log: at most one, in every log in which its channels move.
     """
     commands = list(vessel.commands)
-    alternatives = _alternatives(vessel, commands)
+    alternatives = list(_alternatives(vessel, commands))
     answers = [
         None
         if any(f.id == "frame" and not f.safe for f in told)
@@ -192,16 +193,14 @@ def _moves(recording: Recording, channels: Sequence[str]) -> bool:
 def _finding(a: _Alternative, gain: float, count: int, names: tuple[str, ...]) -> Finding:
     value = -1.0 if len(a.repair[0].channels) == 1 else 0.0
     beside = f" in {count} logs together" if count > 1 else ""
-    return Finding(
+    return exact_finding(
         "sign",
-        a.channels[0],
+        a.channels,
         value,
-        (value, value),
         "1",
         f"the ship answers as if {a.words}: read so, the force explains its motion far better "
         f"(log-likelihood higher by {gain:.0f}{beside}); a check of response, not of kinematics",
         a.fix,
-        a.channels,
         a.repair,
         logs=names,
     )
@@ -219,10 +218,8 @@ def _turning_motion(recording: Recording) -> Motion | None:
     motion = make_motion(recording, ("u", "v", "psi"))
     if motion is None or "psi" not in motion:
         return None
-    psi, rate = denoise(motion["psi"], motion), np.empty(len(motion))
-    for a, b in motion.stretches:
-        rate[a:b] = np.gradient(psi[a:b], motion.step)
     values = {s: motion[s] for s in ("u", "v") if s in motion}
+    rate = slope(denoise(motion["psi"], motion), motion)
     return replace(motion, values=values | {"r": rate})
 
 
@@ -279,7 +276,7 @@ def _picture(
 
 def _held(recording: Recording, name: str, t: Array) -> Array:
     s = recording[name]
-    keep = np.isfinite(s.value) & np.isfinite(s.t)
+    keep = s.known
     order = np.argsort(s.t[keep], kind="stable")
     return hold(make_clock(s.t[keep][order]), s.value[keep][order], t)
 
@@ -357,52 +354,42 @@ def _force_of(force: dict[str, Array], state: str) -> Array | None:
     return rudder if state == "r" and rudder is not None else None
 
 
-def _alternatives(vessel: Vessel, commands: list[str]) -> list[_Alternative]:
-    found = []
+def _alternatives(vessel: Vessel, commands: list[str]) -> Iterator[_Alternative]:
     angles = [c for c in commands if c in vessel.angle_commands]
     speeds = [c for c in commands if c not in vessel.angle_commands]
     for name in commands:
-        found.append(
-            _Alternative(
-                (name,), f"{name} were reversed",
-                f"look at the sign of {name}: map it with sign = -1, or import --fix-also sign",
-                (mend("scale", (name,), factor=-1.0),),
-            )
+        yield _Alternative(
+            (name,), f"{name} were reversed",
+            f"look at the sign of {name}: map it with sign = -1, or import --fix-also sign",
+            (mend("scale", (name,), factor=-1.0),),
         )  # fmt: skip
     if len(angles) > 1:
-        found.append(
-            _Alternative(
-                tuple(angles), "all angles were reversed",
-                "map the angles with sign = -1, or import --fix-also sign",
-                (mend("scale", tuple(angles), factor=-1.0),),
-            )
+        yield _Alternative(
+            tuple(angles), "all angles were reversed",
+            "map the angles with sign = -1, or import --fix-also sign",
+            (mend("scale", tuple(angles), factor=-1.0),),
         )  # fmt: skip
     for group in (speeds, angles):
         for a, b in combinations(group, 2):
-            found.append(
-                _Alternative(
-                    (a, b), f"{a} and {b} were swapped",
-                    f"look at which column belongs to which thruster: exchange {a} and {b} in the "
-                    f"vessel file, or import --fix-also sign",
-                    (mend("exchange", (a, b)),),
-                )
+            yield _Alternative(
+                (a, b), f"{a} and {b} were swapped",
+                f"look at which column belongs to which thruster: exchange {a} and {b} in the "
+                f"vessel file, or import --fix-also sign",
+                (mend("exchange", (a, b)),),
             )  # fmt: skip
     for one, two in combinations(vessel.thrusters, 2):
         # a thruster swapped with its angle
         if isinstance(one.angle, str) and isinstance(two.angle, str):
             pairs = ((one.speed, two.speed), (one.angle, two.angle))
             if one.speed != two.speed and one.angle != two.angle:
-                found.append(
-                    _Alternative(
-                        (one.speed, two.speed, one.angle, two.angle),
-                        f"thruster {one.speed}, {one.angle} and {two.speed}, {two.angle} were "
-                        f"swapped",
-                        "exchange both columns of the two thrusters in the vessel file, or import "
-                        "--fix-also sign",
-                        tuple(mend("exchange", p) for p in pairs),
-                    )
+                yield _Alternative(
+                    (one.speed, two.speed, one.angle, two.angle),
+                    f"thruster {one.speed}, {one.angle} and {two.speed}, {two.angle} were "
+                    f"swapped",
+                    "exchange both columns of the two thrusters in the vessel file, or import "
+                    "--fix-also sign",
+                    tuple(mend("exchange", p) for p in pairs),
                 )  # fmt: skip
-    return found
 
 
 def _as_read(inputs: dict[str, Array], alternative: _Alternative) -> dict[str, Array]:

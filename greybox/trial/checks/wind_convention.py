@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.checks.finding import Finding
+from greybox.trial.checks.finding import Finding, exact_finding
 from greybox.trial.checks.motion import make_motion, smooth, to_ned
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import Step, mend
@@ -112,16 +112,14 @@ def wind_findings(recording: Recording, findings: list[Finding]) -> list[Finding
     option = "--fix" if tied else f"--fix-also {convention.id}"
     value = -1.0 if any(s.operation == "scale" for s in convention.repair) else 0.0
     return [
-        Finding(
+        exact_finding(
             convention.id,
-            convention.channels[0],
+            convention.channels,
             value,
-            (value, value),
             "1",
             f"{convention.words}: read so, the true wind is {ratio:.1f} times steadier while the "
             f"ship turns over {np.degrees(np.ptp(psi)):.0f} deg{doubt}",
             f"{convention.fix} (import {option} does)" if convention.repair else convention.fix,
-            convention.channels,
             convention.repair,
             tied and bool(convention.repair),
             {

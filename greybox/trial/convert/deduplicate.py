@@ -47,7 +47,7 @@ def clean_signals(recording: Recording, origin: tuple[float, float] | None = Non
     signals = []
     clocks: dict[tuple[int, bytes], Array] = {}
     for s in made.signals:
-        keep = np.isfinite(s.value) & np.isfinite(s.t)
+        keep = s.known
         once = np.concatenate([[True], np.diff(s.t) > 0]) if len(s) else keep
         if not once.all():
             repeated.setdefault(id(s.t), (s.name, int((~once).sum())))

@@ -275,7 +275,7 @@ def _grid(
     clean = {}
     for name in names:
         s = recording[name]
-        good = np.isfinite(s.t) & np.isfinite(s.value)
+        good = s.known
         order = np.argsort(s.t[good], kind="stable")
         t, value = s.t[good][order], s.value[good][order]
         clean[name] = (t, continuous(value) if name in {"psi", *angles} else value)

@@ -240,7 +240,7 @@ class _Found:
             self.origin = _first_position(recording)
         keeps: dict[tuple[int, bytes], Array] = {}
         for s in derive_signals(recording, self.origin).signals:
-            keep = np.isfinite(s.t) & np.isfinite(s.value)
+            keep = s.known
             t = keeps.setdefault((id(s.t), np.packbits(keep).tobytes()), s.t[keep])
             self.parts.setdefault(s.name, _Parts(self.options.max_gap)).add(t)
 

@@ -134,7 +134,7 @@ def _profiles(
     held = {}
     for c in vessel.commands:
         s = recording[c]
-        keep = np.flatnonzero(np.isfinite(s.value) & np.isfinite(s.t))
+        keep = np.flatnonzero(s.known)
         if len(keep) < 2:
             return {}
         keep = keep[np.argsort(s.t[keep], kind="stable")]
