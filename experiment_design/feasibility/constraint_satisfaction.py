@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from experiment_design.constraints.kinds.margin import Margin
 from experiment_design.constraints.limits import TOLERANCE
-from experiment_design.excitation.rollout import Rollout
 from experiment_design.optimise.campaign import search_campaign
 from experiment_design.optimise.search import Candidate, assess
 from experiment_design.request.problem import TrialProblem
@@ -96,10 +95,7 @@ def keep_probability(
     thetas = request.draw_models(draws, 1)
     plain = replace(request, backoff=())
     for t, c in enumerate(commands):
-        nominal = Rollout(
-            plain.vessel, plain.structure, plain.theta, plain.d, plain.starts[t],
-            plain.sample_time, plain.integrator,
-        )  # fmt: skip
+        nominal = plain.rollout(plain.starts[t])
         program = plain.limit_program(nominal, t)
         motion = nominal.run_models(thetas, c, late=True)
         if plain.misfit is not None:

@@ -315,9 +315,7 @@ def legs_of(design: Design) -> LegPlan:
     trials, off, off_clock, kept, kept_clock = [], [], [], [], []
     judged = drawn_models(r, _JUDGED, 4)
     for trial, commands in enumerate(design.commands):
-        rollout = Rollout(
-            r.vessel, r.structure, r.theta, r.d, r.starts[trial], r.sample_time, r.integrator
-        )
+        rollout = r.rollout(r.starts[trial])
         legs = _chosen(design, trial, rollout)
         trials.append(legs)
         sailed = sail_legs(rollout, judged, legs, schedule)

@@ -8,7 +8,6 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.excitation.rollout import Rollout
 from experiment_design.request.request import PreparedRequest
 from greybox.channels import CHANNELS
 from greybox.errors import UsageError
@@ -80,10 +79,7 @@ def steady_motions(request: PreparedRequest, start: Array | None = None) -> Stea
     values = schedule.lower + (schedule.upper - schedule.lower) * grid
     rest = np.zeros(len(structure.states) + 1)
     rest[0] = 0.1
-    rollout = Rollout(
-        request.vessel, structure, request.theta, request.d, rest if start is None else start,
-        request.sample_time, request.integrator,
-    )  # fmt: skip
+    rollout = request.rollout(rest if start is None else start)
     motion = rollout.run(np.repeat(values[:, None], samples, axis=1))
     nx = rollout.nx
     x = motion.state[:, -1, :nx]

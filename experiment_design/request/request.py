@@ -372,6 +372,13 @@ class PreparedRequest(TrialOptions):
         kind = PREDICTORS[self.predictor]
         return kind.captures and not kind.air_measured
 
+    def rollout(self, start: Array, theta: Array | None = None) -> Rollout:
+        """Return the motion from a start, by the prior model or by one with other coefficients."""
+        return Rollout(
+            self.vessel, self.structure, self.theta if theta is None else theta, self.d, start,
+            self.sample_time, self.integrator,
+        )  # fmt: skip
+
     def limit_program(self, rollout: Rollout, trial: int) -> LimitProgram:
         """Return the compiled limits of one trial under its own or another prior model."""
         return LimitProgram(
@@ -542,10 +549,7 @@ def build_problem(
     schedule = request.schedule
     scenarios = []
     for k, theta in enumerate(request.thetas()):
-        rollout = Rollout(
-            request.vessel, request.structure, theta, request.d, request.starts[trial],
-            request.sample_time, request.integrator,
-        )  # fmt: skip
+        rollout = request.rollout(request.starts[trial], theta)
         program = request.limit_program(rollout, trial)
         information = assumed.information(
             predictor,
