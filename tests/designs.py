@@ -34,6 +34,17 @@ def limited_ship(speed=None, angle=None, angles=(0.6, 1.1)):
     return replace(ship, thrusters=thrusters)
 
 
+def ship_file(least=0.6, *more):
+    """The vessel file of that ship without rates, with further lines of its sensors."""
+    thrusters = "".join(
+        f'[[thruster]]\ntype = "azimuth"\nx = {x}\ny = 0.0\nspeed = "n"\nangle = "{a}"\n'
+        f"speed_limits = [10.0, 20.0]\nangle_limits = [{least}, 1.1]\n"
+        for x, a in ((9.0, "alpha1"), (-9.0, "alpha2"))
+    )
+    sensors = "\n".join(("u_std = 0.0141", "v_std = 0.0141", "r_std = 0.0141", *more))
+    return f'name = "Thesis ship"\nlength = 30.0\n{thrusters}[sensors]\n{sensors}\n'
+
+
 def make_request(structure="thesis", duration=120.0, **changes) -> PreparedRequest:
     """A request for the thesis's ship within narrower limits, with changes."""
     s = get_structure(structure)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from designs import make_request, thesis_model
+from designs import make_request, ship_file, thesis_model
 from virtual import virtual_log, write_csv
 
 from experiment_design.after import lacking_margin, log_moments, log_motion, sailed_trial
@@ -26,16 +26,6 @@ from greybox.model.model import load_model
 from greybox.model.predictor import build_predictor
 from greybox.trial.log import TrialLog, make_log
 from greybox.validation.fit import run_model
-
-SHIP = (
-    'name = "Thesis ship"\nlength = 30.0\n'
-    + "".join(
-        f'[[thruster]]\ntype = "azimuth"\nx = {x}\ny = 0.0\nspeed = "n"\nangle = "{a}"\n'
-        f"speed_limits = [10.0, 20.0]\nangle_limits = [0.6, 1.1]\n"
-        for x, a in ((9.0, "alpha1"), (-9.0, "alpha2"))
-    )
-    + "[sensors]\nu_std = 0.0141\nv_std = 0.0141\nr_std = 0.0141\n"
-)
 
 
 def sailed_log(seed: int, samples: int, model=None) -> TrialLog:
@@ -172,7 +162,7 @@ def test_the_plan_covers_what_has_not_been_sailed(request_, model) -> None:
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     place = tmp_path_factory.mktemp("after")
-    (place / "ship.toml").write_text(SHIP)
+    (place / "ship.toml").write_text(ship_file())
     log = sailed_log(1, 400)
     t = log.t
     write_csv(replace(log, channels={**log.channels, "x_n": 0.1 * t, "y_n": 0.2 * t}),

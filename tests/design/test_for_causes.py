@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from designs import PROCESS, limited_ship, make_request, thesis_model
+from designs import PROCESS, limited_ship, make_request, ship_file, thesis_model
 from scipy.stats import chi2, ncx2, norm
 
 from experiment_design.constraints.limits import TrialLimits
@@ -31,25 +31,6 @@ from greybox.trial.log import make_log
 SHIP = replace(
     limited_ship(angles=(-1.1, 1.1)),
     sensors={"u_std": 0.0141, "v_std": 0.0141, "r_std": 0.0141, "heading_std": 0.01},
-)
-TOML = """name = "Thesis ship"
-length = 30.0
-[sensors]
-u_std = 0.0141
-v_std = 0.0141
-r_std = 0.0141
-heading_std = 0.01
-""" + "".join(
-    f"""[[thruster]]
-type = "azimuth"
-x = {x}
-y = 0.0
-speed = "n"
-angle = "{angle}"
-speed_limits = [10.0, 20.0]
-angle_limits = [-1.1, 1.1]
-"""
-    for x, angle in ((9.0, "alpha1"), (-9.0, "alpha2"))
 )
 BIAS = {"heading_bias": {"value": 0.006, "std": 0.003, "unit": "rad"}}
 CURRENT = {
@@ -232,7 +213,7 @@ def test_a_plan_tells_more_than_random_and_usual_trials(found) -> None:
 
 def test_the_command(tmp_path, model, capsys) -> None:
     ship, prior, plan = tmp_path / "ship.toml", tmp_path / "model.json", tmp_path / "plan.csv"
-    ship.write_text(TOML)
+    ship.write_text(ship_file(-1.1, "heading_std = 0.01"))
     model.save(prior)
     given = ["design", "--vessel", str(ship), "--model", str(prior), "--out", str(plan)]
     given += ["--duration", "120", "--effort", "0.1"]

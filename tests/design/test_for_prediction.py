@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from designs import limited_ship, make_request, thesis_model
+from designs import limited_ship, make_request, ship_file, thesis_model
 
 from experiment_design.constraints.limits import TrialLimits
 from experiment_design.excitation.rollout import Rollout
@@ -331,15 +331,7 @@ def test_a_prior_that_cannot_hold_the_ship_is_refused() -> None:
 def files(tmp_path_factory):
     place = tmp_path_factory.mktemp("prediction")
     thesis_model(spread=0.02).save(place / "model.json")
-    (place / "ship.toml").write_text(
-        'name = "Thesis ship"\nlength = 30.0\n'
-        + "".join(
-            f'[[thruster]]\ntype = "azimuth"\nx = {x}\ny = 0.0\nspeed = "n"\nangle = "{a}"\n'
-            f"speed_limits = [10.0, 20.0]\nangle_limits = [0.6, 1.1]\n"
-            for x, a in ((9.0, "alpha1"), (-9.0, "alpha2"))
-        )
-        + "[sensors]\nu_std = 0.0141\nv_std = 0.0141\nr_std = 0.0141\n"
-    )
+    (place / "ship.toml").write_text(ship_file())
     return place
 
 
