@@ -9,7 +9,7 @@ import numpy as np
 
 from greybox.model.model import ManoeuvringModel
 from greybox.report.chart import chart_of
-from greybox.report.figures import comparison_figure, to_svg
+from greybox.report.figures import comparison_figure, percent, to_svg, told_fits
 from greybox.report.next_steps import after_comparison
 from greybox.report.page import Page, Picture, Table, computed
 from greybox.report.thinning import points_for
@@ -17,7 +17,6 @@ from greybox.validation.bands import LEVEL
 from greybox.validation.comparison import Comparison, rmse_titles
 from greybox.validation.fit import mean_fit
 
-_NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
 # with more the page grows and tells nothing new
 MOST_LOGS = 8
 
@@ -25,7 +24,7 @@ MOST_LOGS = 8
 def headline(comparison: Comparison) -> str:
     """Return one sentence on which model fits best and how well."""
     fits, best = comparison.fits(), comparison.best()
-    shown = ", ".join(f"{_NAMES.get(s, s)} {v:.0f} %" for s, v in fits[best].items())
+    shown = told_fits(fits[best], 0)
     count = len(comparison.runs[0])
     logs = f"the {count} logs" if count > 1 else "the log"
     most = " best" if len(fits) > 1 else ""
@@ -48,7 +47,7 @@ def comparison_page(
         for run, rmse, ahead in zip(row, errors, aheads, strict=True):
             fit_rows.append(
                 [name, run.log.name]
-                + [f"{run.fit[s]:.1f}" if run.fit[s] > -1e4 else "diverged" for s in states]
+                + [percent(run.fit[s]).removesuffix(" %") for s in states]
                 + [f"{rmse[s]:.3g}" for s in states]
             )
             for horizon, value in ahead.items():
@@ -107,6 +106,7 @@ def comparison_page(
         headline=headline(comparison),
         sentences=[
             *comparison.notes,
+            *dict.fromkeys(g.sentence for row in comparison.runs for run in row for g in run.gaps),
             *[t.sentence for t in tests],
             *[
                 f"{name}: {d.sentence}"
@@ -155,8 +155,7 @@ def _pictures(comparison: Comparison) -> list[Picture]:
         if any(b is not None and b.coverage for b in bands):
             caption += f" Shaded: where {100 * LEVEL:.0f} % of the measurements should lie."
         fits = "; ".join(
-            f"{name} " + ", ".join(f"{_NAMES.get(s, s)} {_percent(v)}" for s, v in run.fit.items())
-            for name, run in zip(comparison.names, runs, strict=True)
+            f"{name} {told_fits(run.fit)}" for name, run in zip(comparison.names, runs, strict=True)
         )
         printed, zoomed = (
             comparison_figure(comparison.names, runs, bands, points=points_for(curves, **room))
@@ -182,10 +181,6 @@ def _left_out(comparison: Comparison) -> list[str]:
         f"Of {count} logs the one of the lowest fit and the first {MOST_LOGS - 1} others are "
         f"drawn; all are in the tables."
     ]
-
-
-def _percent(fit: float) -> str:
-    return f"{fit:.1f} %" if fit > -1e4 else "diverged"
 
 
 def _band_sentences(comparison: Comparison) -> list[str]:

@@ -27,6 +27,7 @@ from greybox.report.error_budget import (
     largest,
     noise_sentence,
 )
+from greybox.report.figures import NAMES, percent
 from greybox.report.free_run_errors import REGIMES, Errors, gather, simulations
 from greybox.report.model_difference import (
     coefficient_table,
@@ -37,7 +38,6 @@ from greybox.report.next_steps import NextStep
 from greybox.report.page import Page, Picture, Section, Table, computed
 from greybox.report.thinning import points_for
 
-_NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
 _UNITS = {"u": "m/s", "v": "m/s", "r": "rad/s", "psi": "rad"}
 # logs of each kind that are drawn: with more the page grows and tells nothing new
 _MOST_LOGS = 3
@@ -105,7 +105,7 @@ def _summary(diagnosis: Diagnosis) -> list[str]:
     told = [f"Verdict: {diagnosis.verdict}, after {diagnosis.tried} causes were tried."]
     if diagnosis.gain and _changed(diagnosis):
         gains = ", ".join(
-            f"{_NAMES.get(s, s)} from {_percent(g.before)} to {_percent(g.after)}"
+            f"{NAMES.get(s, s)} from {percent(g.before)} to {percent(g.after)}"
             for s, g in diagnosis.gain.items()
         )
         told.append(f"The fit of the free run (100 % is perfect) changes: {gains}.")
@@ -129,10 +129,6 @@ def _remains(diagnosis: Diagnosis) -> Section:
 
 def _changed(diagnosis: Diagnosis) -> bool:
     return any(g.before != g.after for g in diagnosis.gain.values())
-
-
-def _percent(value: float) -> str:
-    return f"{value:.1f} %" if value > -1000 else "diverged"
 
 
 def _wrong(diagnosis: Diagnosis) -> Section:
@@ -228,7 +224,7 @@ def _rms_sentence(errors: Errors) -> str:
     parts = []
     for state in errors.states:
         sizes = ", ".join(f"{errors.rms(name, state):.3g} {name}" for name in errors.error)
-        parts.append(f"{_NAMES.get(state, state)} [{_UNITS.get(state, '')}] {sizes}")
+        parts.append(f"{NAMES.get(state, state)} [{_UNITS.get(state, '')}] {sizes}")
     return f"Root mean square errors: {'; '.join(parts)}."
 
 
@@ -301,8 +297,8 @@ def gain_section(diagnosis: Diagnosis) -> Section:
 def _gain_table(caption: str, gain: Mapping[str, Gain], heads: tuple[str, str]) -> Table:
     rows = [
         [
-            _NAMES.get(s, s), _percent(g.before), _percent(g.after),
-            f"{g.after - g.before:+.1f}" if g.before > -1000 else "",
+            NAMES.get(s, s), percent(g.before), percent(g.after),
+            f"{g.after - g.before:+.1f}" if percent(g.before) != "diverged" else "",
             f"{g.ci[0]:.1f} to {g.ci[1]:.1f}",
         ]
         for s, g in gain.items()

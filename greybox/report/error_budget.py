@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from greybox.diagnosis.budget import SENSOR
 from greybox.diagnosis.result import BudgetPart, Diagnosis
-from greybox.report.figures import BLUE, LABELS, ORANGE, new_figure, tidy
+from greybox.report.figures import BLUE, LABELS, NAMES, ORANGE, new_figure, tidy
 from greybox.report.page import Table
 from greybox.validation.fit import fit_percent
 
@@ -89,7 +89,7 @@ def noise_sentence(diagnosis: Diagnosis) -> str:
     told, bounds = [], []
     for state, own in sensor.after.items():
         share = min(max(own / max(sum(p.after[state] for p in budget), 1e-300), 0.0), 1.0)
-        name = LABELS.get(state, state).split(" ")[0] if state != "r" else "yaw rate"
+        name = NAMES.get(state, state)
         told.append(f"{name} {100 * share:.0f} %")
         if noise is not None and held:
             std = float(noise.measurement[noise.states.index(state)])

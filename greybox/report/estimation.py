@@ -34,7 +34,7 @@ from greybox.report.estimation_figures import (
     tried_figure,
     visited_figure,
 )
-from greybox.report.figures import comparison_figure, to_svg
+from greybox.report.figures import NAMES, comparison_figure, to_svg, told_fits
 from greybox.report.model_difference import shown_unit
 from greybox.report.next_steps import after_estimate
 from greybox.report.page import Page, Picture, Section, Table, computed
@@ -46,7 +46,6 @@ from greybox.validation.fit import mean_fit, run_model
 
 Array = NDArray[np.float64]
 
-_NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
 _OUTCOMES = {True: "passed", False: "speaks against it", None: "tells"}
 # logs that are drawn against time: with more the page grows and tells nothing new
 _MOST_LOGS = 3
@@ -116,10 +115,7 @@ def headline(estimate: Estimate) -> str:
         told = f"Prediction is {prediction.level}: {prediction.reason}. {told}"
     if not estimate.fit:
         return f"{told}."
-    fit = ", ".join(
-        f"{_NAMES.get(s, s)} {v:.0f} %" if v > -1000 else f"{_NAMES.get(s, s)} diverged"
-        for s, v in estimate.fit.items()
-    )
+    fit = told_fits(estimate.fit, 0)
     logs = "log" if len(estimate.logs) == 1 else "logs"
     return f"{told}. Its free run fits the {logs} it was estimated on by {fit} (100 is perfect)."
 
@@ -173,7 +169,6 @@ def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> tuple[Picture, Section
             f"Free run on {log.name} ({len(log)} samples of {log.sample_time:g} s), a log the "
             f"model was estimated on: measured, simulated, and their difference below."
         )
-        fit = ", ".join(f"{_NAMES.get(s, s)} {v:.0f} %" for s, v in run.fit.items())
         printed, zoomed = (
             comparison_figure(["model"], [run], points=points_for(curves, **room))
             for room in ({}, {"most": 10_000, "room": 120_000})
@@ -182,7 +177,7 @@ def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> tuple[Picture, Section
             Picture(
                 to_svg(printed, f"run{i}"),
                 caption,
-                f"{caption} Fit: {fit}.",
+                f"{caption} Fit: {told_fits(run.fit, 0)}.",
                 narrow=len(drawn) > 1,
                 chart=chart_of(zoomed),
             )
@@ -328,7 +323,7 @@ def _residuals(estimate: EstimateValues) -> Section | None:
     if not own and not inputs:
         return None
     told = [
-        _sentence(f"{_NAMES.get(s, s)}: {t.sentence}")
+        _sentence(f"{NAMES.get(s, s)}: {t.sentence}")
         for s in states
         for t in estimate.tests
         if t.state == s and t.kind in ("whiteness", "input_independence")
@@ -356,7 +351,7 @@ def _visited(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
     states = estimate.predictor.structure.states
     values = {s: np.concatenate([log[s] for log in logs]) for s in states}
     ranges = ", ".join(
-        f"{_NAMES.get(s, s)} from {v.min():.2f} to {v.max():.2f}" for s, v in values.items()
+        f"{NAMES.get(s, s)} from {v.min():.2f} to {v.max():.2f}" for s, v in values.items()
     )
     margins = _margins(estimate)
     caption = "How much of the time each value was met, all logs together."
@@ -383,7 +378,7 @@ def _visited(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
             )
         )  # fmt: skip
     told = [
-        _sentence(f"{_NAMES.get(s, s)}: {t.sentence}")
+        _sentence(f"{NAMES.get(s, s)}: {t.sentence}")
         for s in states
         for t in estimate.tests
         if t.state == s and t.kind == "excitation"

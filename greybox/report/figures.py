@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,11 @@ LABELS = {
     "v_q": "v_q [m/s]",
 }
 
+
+# as sentences call the states
+NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
+# fit from which on a run has not left the measurements for good [%]
+_LEFT = -1000.0
 
 # coordinates, whose third decimal (a thousandth of a point) no screen and no printer shows
 _PLACES = re.compile(r' d="[^"]*"| [xy]="[^"]*"|translate\([^)]*\)')
@@ -123,7 +128,7 @@ def comparison_figure(
                 "linestyle": STYLES[j % 4],
                 "linewidth": 1.3,
             }
-            shown = f"{run.fit[state]:.1f} %" if run.fit[state] > -1000 else "diverged"
+            shown = percent(run.fit[state])
             error = np.clip(measured - x, -spread, spread)
             short = shorten(name)
             label = f"{short}: fit {shown}"
@@ -162,6 +167,16 @@ def comparison_figure(
     figure.align_ylabels()
     figure.suptitle(f"Free run on {shorten(log.name, 50)}", fontsize=10)
     return figure
+
+
+def percent(fit: float, digits: int = 1) -> str:
+    """Return a fit (6.12) [%] in words."""
+    return f"{fit:.{digits}f} %" if fit > _LEFT else "diverged"
+
+
+def told_fits(fit: Mapping[str, float], digits: int = 1) -> str:
+    """Return the fit of each state in words."""
+    return ", ".join(f"{NAMES.get(s, s)} {percent(v, digits)}" for s, v in fit.items())
 
 
 def shorten(name: str, most: int = 24) -> str:

@@ -13,7 +13,16 @@ from greybox.fleet.fleet import Fleet, ShipEstimate
 from greybox.fleet.pooling import LEVEL
 from greybox.fleet.trend import Trend
 from greybox.report.chart import chart_of
-from greybox.report.figures import BLACK, BLUE, VERMILION, new_figure, shorten, tidy, to_svg
+from greybox.report.figures import (
+    BLACK,
+    BLUE,
+    VERMILION,
+    new_figure,
+    percent,
+    shorten,
+    tidy,
+    to_svg,
+)
 from greybox.report.next_steps import after_fleet
 from greybox.report.page import Page, Picture, Section, Table, computed
 
@@ -147,9 +156,7 @@ def _ships_section(fleet: Fleet) -> Section:
     """Show the ships one by one, and each coefficient of all of them."""
     rows = []
     for ship, compared in zip(fleet.ships, fleet.comparisons, strict=True):
-        fit = ", ".join(
-            f"{k} {v:.0f}" if v > -1000 else f"{k} diverged" for k, v in ship.fit.items()
-        )
+        fit = ", ".join(f"{k} {percent(v, 0).removesuffix(' %')}" for k, v in ship.fit.items())
         named = ", ".join(fleet.names[d.coefficient] for d in compared.differences)
         rows.append(
             [ship.name, str(ship.logs), _number(float(np.sqrt(compared.statistic)), ".3g"),

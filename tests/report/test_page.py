@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from browser import driven, needs_browser, require_legible
@@ -60,6 +62,25 @@ def test_comparison_figure_has_labels_and_units(clean_log, thesis, true_theta):
     labels = [a.get_ylabel() for a in figure.axes]
     assert "surge u [m/s]" in labels
     assert figure.axes[-1].get_xlabel() == "time from the first sample [s]"
+
+
+def test_a_comparison_tells_of_gaps_and_of_runs_that_left(clean_log, thesis, true_theta):
+    from greybox.model.model import ManoeuvringModel
+    from greybox.report.comparison import comparison_page
+    from greybox.trial.segments import join_segments
+    from greybox.validation.comparison import compare
+
+    model = ManoeuvringModel(thesis, true_theta, np.eye(len(true_theta)), 1.0, clean_log.vessel)
+    log = join_segments([clean_log.window(0, 100), clean_log.window(110, 200)], "two")
+    found = compare({"m": model}, log, bands=False)
+    told = comparison_page(found, [model], {}).sentences
+    assert [s for s in told if "a run begins anew after it" in s]
+    (run,) = found.runs[0]
+    left = replace(found, runs=((replace(run, fit={"u": -2320.0, "v": -np.inf, "r": -261.4}),),))
+    page = comparison_page(left, [model], {})
+    assert ": surge diverged, sway diverged, yaw rate -261 % (100" in page.headline
+    assert page.tables[0].rows[0][2:5] == ["diverged", "diverged", "-261.4"]
+    assert page.lead.alternative.endswith("m surge diverged, sway diverged, yaw rate -261.4 %.")
 
 
 @needs_browser
