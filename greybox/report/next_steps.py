@@ -121,7 +121,15 @@ def after_check(reports: Sequence[CheckReport], record: Mapping[str, Any]) -> li
     if judged:
         also = " ".join(f"--fix-also {i}" for i in judged)
         steps.append(NextStep("Mend these too where their pictures convince you", f"{mend} {also}"))
-    if not steps:
+    blind = [r for r in reports if r.recording is not None and "psi" not in r.recording]
+    if not steps and blind:
+        steps.append(
+            NextStep(
+                f"Name the column of '{blind[0].name}' that holds the heading as psi, with its "
+                f"unit, in the vessel file's [columns]: models of sway and yaw need it"
+            )
+        )
+    elif not steps:
         steps.append(
             NextStep(
                 "Estimate a model",

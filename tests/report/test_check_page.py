@@ -17,6 +17,7 @@ from greybox.report.agreement import compare, find_widths, shifted, smoothed
 from greybox.report.check_ties import make_tie, mended_in_words
 from greybox.report.checks import alternative, caption, check_page, finding_figure, headline
 from greybox.report.figures import to_svg
+from greybox.report.next_steps import after_check
 from greybox.trial.checks.course import course_findings
 from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome
 from greybox.trial.checks.frame_sign_unit import (
@@ -344,6 +345,17 @@ def test_identifiers_of_several_logs_do_not_collide(tmp_path):
     check_page([row_case("gap"), row_case("stuck")], [Path("a"), Path("b")], SHIP, path)
     ids = re.findall(r'\bid="([^"]+)"', path.read_text())
     assert len(ids) == len(set(ids))
+
+
+def test_what_comes_next_is_a_model_only_of_logs_that_have_a_heading():
+    c = columns()
+    whole = report_of([], as_recording(c))
+    blind = report_of([], as_recording({n: c[n] for n in ("t", "u", "v", "r", "n")}))
+    (step,) = after_check([whole], {})
+    assert step.command.startswith("greybox estimate LOG… ")
+    (step,) = after_check([whole, blind], {})
+    assert step.command == ""
+    assert "'virtual' that holds the heading as psi" in step.purpose
 
 
 def test_headline_names_the_most_serious():
