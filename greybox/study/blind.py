@@ -22,7 +22,7 @@ from greybox.study.blind_conditions import Conditions, blind_vessel, vessel_text
 from greybox.study.blind_effects import act, check_effects, draw_effect
 from greybox.study.blind_inputs import KINDS, steer
 from greybox.study.blind_sensors import gauss_markov, observe, wanted
-from greybox.study.blind_ship import LEAD, NAMES, History, Ship, simulate_ships
+from greybox.study.blind_ship import LEAD, NAMES, STEP, History, Ship, simulate_ships
 from greybox.study.chapter6 import TRUE
 from greybox.trial.log import TrialLog, make_log
 from greybox.trial.store import write_log
@@ -276,11 +276,9 @@ def _disturb(
         draft.felt.append(felt)
 
 
-def _sail(drafts: Sequence[_Draft], conditions: Conditions, step: float | None = None) -> History:
+def _sail(drafts: Sequence[_Draft], conditions: Conditions, step: float = STEP) -> History:
     ships = [ship for draft in drafts for ship in draft.ships]
-    if step is not None:
-        return simulate_ships(ships, euler=conditions.euler, linear=conditions.linear, step=step)
-    return simulate_ships(ships, euler=conditions.euler, linear=conditions.linear)
+    return simulate_ships(ships, euler=conditions.euler, linear=conditions.linear, step=step)
 
 
 def _bounded(history: History, bound: Array) -> list[bool]:

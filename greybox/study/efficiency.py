@@ -73,6 +73,11 @@ class Share:
     low: float
     high: float
 
+    @classmethod
+    def of(cls, log: float, half: float) -> Share:
+        """Return it from its logarithm and half of the interval of that."""
+        return cls(*(float(np.exp(v)) for v in (log, log - half, log + half)))
+
 
 @dataclass(frozen=True)
 class CaseResult:
@@ -115,11 +120,7 @@ class CaseResult:
         spread = 1.96 * np.sqrt(float(polygamma(1, n / 2)))
         # E log χ²_n = ψ(n/2) + log 2
         level = np.log(errors.var(axis=0, ddof=1)) - float(psi(n / 2)) - np.log(2 / n)
-        log = np.log(np.diag(bound)) - level
-        return [
-            Share(float(np.exp(v)), float(np.exp(v - spread)), float(np.exp(v + spread)))
-            for v in log
-        ]
+        return [Share.of(v, spread) for v in np.log(np.diag(bound)) - level]
 
     def coverage(self, estimator: str) -> Array:
         """Return the share of 95 % intervals that hold the truth, (p,)."""
@@ -183,8 +184,7 @@ def determinant_efficiency(errors: Array, bound: Array) -> Share:
     half = (n - np.arange(p)) / 2
     found -= float(psi(half).sum()) + p * np.log(2 / n)
     spread = 1.96 * np.sqrt(float(polygamma(1, half).sum())) / p
-    value = (float(scaled_logdet(bound)) - found) / p
-    return Share(float(np.exp(value)), float(np.exp(value - spread)), float(np.exp(value + spread)))
+    return Share.of((float(scaled_logdet(bound)) - found) / p, spread)
 
 
 def virtual_trial(rng: np.random.Generator, case: Case, samples: int = SAMPLES) -> TrialLog:
@@ -272,10 +272,8 @@ def _bounds(case: Case, samples: int) -> tuple[Array, Array]:
     structure = get_structure("thesis")
     linear, output = _predictors()
     log = virtual_trial(np.random.default_rng(0), case, samples)
-    sigma = np.sqrt(SENSOR_VARIANCE)
-    noise = NoiseLevels(
-        structure.states, np.full(3, sigma), np.array(case.process), np.sqrt(HEADING_VARIANCE)
-    )
+    sigma = np.full(3, np.sqrt(SENSOR_VARIANCE))
+    noise = NoiseLevels(structure.states, sigma, np.array(case.process), np.sqrt(HEADING_VARIANCE))
     model = output_model(output, 1.0, "output")
     p = np.array([*[TRUE[c.name] for c in output.columns], *CURRENT])
     whole = cramer_rao(

@@ -201,6 +201,11 @@ class Share:
         """The interval of Wilson (1927)."""
         return wilson_interval(self.value, self.runs)
 
+    @property
+    def error(self) -> float:
+        """Binomial standard error of the share."""
+        return float(np.sqrt(self.value * (1 - self.value) / self.runs))
+
     def __str__(self) -> str:
         if not self.runs:
             return ""
@@ -295,20 +300,15 @@ class Power:
 
             for answer in ANSWERS:
                 share = self.share(cell, answer)
-                p = share.value
-                rows.append(
-                    row("power", answer, p, float(np.sqrt(p * (1 - p) / share.runs)), share.runs)
-                )
+                rows.append(row("power", answer, share.value, share.error, share.runs))
             count = Counter(o.found for o in self.of(cell))
             for name, hits in sorted(count.items()):
-                p = hits / len(self.of(cell))
-                sd = float(np.sqrt(p * (1 - p) / len(self.of(cell))))
-                rows.append(row("confusion", name, p, sd, len(self.of(cell))))
+                share = Share(hits, len(self.of(cell)))
+                rows.append(row("confusion", name, share.value, share.error, share.runs))
             for name, pairs in self.errors(cell).items():
                 rows.append(row("error", name, *_moments([e for e, _ in pairs]), len(pairs)))
-                inside = float(np.mean([abs(e) <= 1.96 * s for e, s in pairs]))
-                sd = float(np.sqrt(inside * (1 - inside) / len(pairs)))
-                rows.append(row("95 % interval holds", name, inside, sd, len(pairs)))
+                share = Share(sum(abs(e) <= 1.96 * s for e, s in pairs), len(pairs))
+                rows.append(row("95 % interval holds", name, share.value, share.error, share.runs))
             for name, values in self.gains(cell).items():
                 rows.append(row("gain", name, *_moments(values), len(values)))
         return sorted(rows, key=lambda r: r.table)
