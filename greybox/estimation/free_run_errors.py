@@ -25,8 +25,9 @@ Array = NDArray[np.float64]
 
 # cycles a log below which power counts as slow
 _CORNERS = (8.0, 24.0, 72.0)
-# of the draws of `memory_correction`, and the most that it may multiply a variance by
-_SEED, _CORRECTION = 11, 9.0
+# of the draws of `memory_correction` and `slow_errors`, how many each has, and the most that the
+# former may multiply a variance by
+_SEED, _DRAWS, _CORRECTION = 11, (40, 99), 9.0
 # process noise to start from, in deviations of the measurements
 _BESIDE = 0.1
 # least and largest process noise that is tried, likewise, and how many
@@ -90,7 +91,7 @@ def flat_top_autocovariance(residuals: Sequence[Array], lags: int) -> Array:
 
 
 def memory_correction(
-    rows: Sequence[Array], hessian: Array, residuals: Sequence[Array], lags: int, *, draws: int = 40
+    rows: Sequence[Array], hessian: Array, residuals: Sequence[Array], lags: int
 ) -> Array:
     """Return by how much the fit hides the memory of its residuals from the standard errors.
 
@@ -108,7 +109,6 @@ def memory_correction(
     residuals : sequence of ndarray
         (N, ny) of each experiment.
     lags : int
-    draws : int
 
     Returns
     -------
@@ -126,13 +126,13 @@ def memory_correction(
         return np.asarray(sum(np.einsum("lab,qlab->q", g[: c.shape[1]], c) for c in products))
 
     found = np.zeros(len(hessian))
-    for _ in range(draws):
+    for _ in range(_DRAWS[0]):
         errors = [_draw(rng, root, len(r)) for root, r in zip(roots, residuals, strict=True)]
         shift = sum(np.einsum("qkc,kc->q", e, r) for e, r in zip(moved, errors, strict=True))
         left = [r - np.einsum("qkc,q->kc", e, shift) for e, r in zip(rows, errors, strict=True)]
         found += np.maximum(variance(flat_top_autocovariance(left, lags)), 0.0)
     truth = np.maximum(variance(gamma), 0.0)
-    ratio = truth * draws / np.maximum(found, 1e-300)
+    ratio = truth * _DRAWS[0] / np.maximum(found, 1e-300)
     return np.asarray(np.sqrt(np.clip(ratio, 1.0, _CORRECTION)), float)
 
 
@@ -186,7 +186,7 @@ def _filtered_products(rows: Array, gamma: Array) -> Array:
 
 
 def slow_errors(
-    rows: Sequence[Array], hessian: Array, residuals: Sequence[Array], *, draws: int = 99
+    rows: Sequence[Array], hessian: Array, residuals: Sequence[Array]
 ) -> tuple[Array, Array]:
     """Test whether free-run errors wander, channel by channel.
 
@@ -202,13 +202,12 @@ def slow_errors(
         (q, q) Σ E Eᵀ.
     residuals : sequence of ndarray
         (N, ny) of each experiment.
-    draws : int
 
     Returns
     -------
     tuple of ndarray
         (ny,) how many standard deviations of the drawn powers the power lies above
-        their mean, and (ny,) Monte Carlo p-values, multiples of 1/(draws + 1).
+        their mean, and (ny,) Monte Carlo p-values, multiples of a hundredth.
 
     References
     ----------
@@ -227,24 +226,17 @@ def slow_errors(
         level = np.sum([(r**2).sum(axis=0) for r in errors], axis=0)
         return np.asarray(out / np.maximum(level, 1e-300))
 
+    flat = [e.reshape(len(e), -1) for e in rows]
     drawn = [power(residuals)]
-    for _ in range(draws):
+    for _ in range(_DRAWS[1]):
         errors = [rng.standard_normal(r.shape) for r in residuals]
-        shift = inverse @ sum(
-            e.reshape(len(e), -1) @ r.ravel() for e, r in zip(rows, errors, strict=True)
-        )
-        drawn.append(
-            power(
-                [
-                    r - (shift @ e.reshape(len(e), -1)).reshape(r.shape)
-                    for e, r in zip(rows, errors, strict=True)
-                ]
-            )
-        )
+        pairs = list(zip(flat, errors, strict=True))
+        shift = inverse @ sum(e @ r.ravel() for e, r in pairs)
+        drawn.append(power([r - (shift @ e).reshape(r.shape) for e, r in pairs]))
     values = np.array(drawn)
     spread = values[1:].std(axis=0)
     most = ((values - values[1:].mean(axis=0)) / np.where(spread > 0, spread, 1.0)).max(axis=1)
-    return most[0], (1 + (most[1:] >= most[0]).sum(axis=0)) / (1 + draws)
+    return most[0], (1 + (most[1:] >= most[0]).sum(axis=0)) / (1 + _DRAWS[1])
 
 
 def residual_noise(runs: FreeRuns, p: Array, nodes: Array, loss: Loss) -> FreeRuns:

@@ -6,7 +6,7 @@ what an unmeasured wind does (its moments are coefficients, as in chapter 5).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -634,7 +634,7 @@ def _score(runs: FreeRuns, p: Array, nodes: Array, *, concentrated: bool) -> Arr
 
 def _excitation_tests(
     model: OutputModel, hessian: Array, bound: NDArray[np.bool_]
-) -> tuple[TestResult, ...]:
+) -> Iterator[TestResult]:
     """Tell, equation by equation, how well the run determines its weakest parameter and direction.
 
     The share of a parameter's sensitivity that no other unknown imitates is
@@ -644,7 +644,6 @@ def _excitation_tests(
     unit, _ = scaled(hessian[np.ix_(free, free)])
     share = 1 / np.diag(scaled_inverse(unit))
     columns = model.predictor.columns
-    out = []
     for state in model.predictor.structure.states:
         mine = [i for i, k in enumerate(free) if k < len(columns) and columns[k].state == state]
         if not mine:
@@ -662,27 +661,23 @@ def _excitation_tests(
             else f"the combination of {', '.join(names)} is weakly determined: change what "
             f"these parameters multiply separately"
         )
-        out.append(
-            TestResult(
-                "excitation",
-                "the sensitivities of the run are independent",
-                ratio,
-                None,
-                f"smallest relative singular value {ratio:.1e} ({_WEAK:.0e} is needed): {found}. "
-                f"Of the sensitivity to {model.parameters[free[least]]} the least, "
-                f"{float(share[least]):.1e}, cannot be explained by those to the others.",
-                _WEAK,
-                passed,
-                tuple(names),
-                {"own_share": {model.parameters[free[i]]: float(share[i]) for i in mine}},
-                state=state,
-            )
+        yield TestResult(
+            "excitation",
+            "the sensitivities of the run are independent",
+            ratio,
+            None,
+            f"smallest relative singular value {ratio:.1e} ({_WEAK:.0e} is needed): {found}. "
+            f"Of the sensitivity to {model.parameters[free[least]]} the least, "
+            f"{float(share[least]):.1e}, cannot be explained by those to the others.",
+            _WEAK,
+            passed,
+            tuple(names),
+            {"own_share": {model.parameters[free[i]]: float(share[i]) for i in mine}},
+            state=state,
         )
-    return tuple(out)
 
 
-def _slow_tests(slow: Mapping[str, tuple[float, float]]) -> tuple[TestResult, ...]:
-    out = []
+def _slow_tests(slow: Mapping[str, tuple[float, float]]) -> Iterator[TestResult]:
     for name, (z, p) in slow.items():
         found = (
             "wanders more than a fit to white noise would: something that the model lacks moves "
@@ -690,17 +685,14 @@ def _slow_tests(slow: Mapping[str, tuple[float, float]]) -> tuple[TestResult, ..
             if p <= _WANDERS
             else "shows no slow part beyond noise."
         )
-        out.append(
-            TestResult(
-                "slow_errors",
-                f"the free-run error of {name} is white: nothing that the model lacks moves it",
-                z,
-                p,
-                f"the free-run error of {name} {found}",
-                state=name,
-            )
+        yield TestResult(
+            "slow_errors",
+            f"the free-run error of {name} is white: nothing that the model lacks moves it",
+            z,
+            p,
+            f"the free-run error of {name} {found}",
+            state=name,
         )
-    return tuple(out)
 
 
 def _require_known(model: OutputModel, hessian: Array, bound: NDArray[np.bool_]) -> None:

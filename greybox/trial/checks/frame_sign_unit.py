@@ -8,7 +8,7 @@ heading to positions, the course over ground tells whether heading or yaw rate i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -468,7 +468,7 @@ def _ways(m: Motion) -> tuple[NDArray[np.complex128], ...]:
     return ways
 
 
-def _late(motion: Motion) -> list[ColumnHypothesis]:
+def _late(motion: Motion) -> Iterator[ColumnHypothesis]:
     """Return readings with some channels moved in time, so that lateness is no frame or unit."""
 
     # by whole samples: between samples the noise would be averaged, which looks like agreement
@@ -484,7 +484,6 @@ def _late(motion: Motion) -> list[ColumnHypothesis]:
 
         return apply
 
-    found = []
     for names in (("psi",), ("u", "v"), ("x_n", "y_n")):
         for late in _LATENESS:
             # steps of logs differ, what is tried does not
@@ -492,12 +491,9 @@ def _late(motion: Motion) -> list[ColumnHypothesis]:
             words = f"{' and '.join(names)} {late:g} s late"
             if steps == 0:
                 continue
-            found.append(
-                ColumnHypothesis(
-                    "sign", "late", names, shifted(names, steps), (), words, "", late, "s", cost=1.3
-                )
+            yield ColumnHypothesis(
+                "sign", "late", names, shifted(names, steps), (), words, "", late, "s", cost=1.3
             )
-    return found
 
 
 def _silent(changes: tuple[ColumnHypothesis, ...]) -> ColumnHypothesis:

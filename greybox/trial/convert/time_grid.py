@@ -168,12 +168,11 @@ def plan_import(
     held = [n for n in used if n not in (*reference, *beside) and used[n].steady]
     late = [n for n in inputs if n not in reference and n not in held]
     reference = [*reference, *held]
-    start = max(used[n].first for n in (*reference, *late))
-    stop = min(used[n].last for n in reference)
+    one = max((*reference, *late), key=lambda n: used[n].first)
+    two = min(reference, key=lambda n: used[n].last)
+    start, stop = used[one].first, used[two].last
     # a held value lasts until the next would have come
     if stop - start < (MIN_SEGMENT - 1) * sample_time * (1 - 1e-6):
-        one = max((*reference, *late), key=lambda n: used[n].first)
-        two = min(reference, key=lambda n: used[n].last)
         raise LogError(
             f"the signals of '{name}' overlap from {start:.6g} s ({one}) to {stop:.6g} s ({two}), "
             f"less than {MIN_SEGMENT} samples of {sample_time:g} s: check the clocks of the "
@@ -189,8 +188,6 @@ def plan_import(
     shaping = [e for n, e in used.items() if n not in beside]
     longest = max(e.last for e in shaping) - min(e.first for e in shaping)
     if stop - start < 0.9 * longest:
-        one = max((*reference, *late), key=lambda n: used[n].first)
-        two = min(reference, key=lambda n: used[n].last)
         notes.append(
             f"of {longest:.4g} s, {start:.6g} s ({one} begins) to {stop:.6g} s ({two} ends) are "
             f"covered by every signal"

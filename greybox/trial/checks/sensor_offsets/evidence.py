@@ -192,9 +192,7 @@ def fit(likelihood: Likelihood, start: Array, prior: Array) -> Array:
     return offsets
 
 
-def search(
-    tie: KinematicModel, coarse: KinematicModel, prior: Array, near: Array | None = None
-) -> Array:
+def search(tie: KinematicModel, coarse: KinematicModel, prior: Array) -> Array:
     """Return the offsets of one log, large ones too, looked for on a coarse grid of clocks.
 
     Parameters
@@ -202,12 +200,10 @@ def search(
     tie, coarse : KinematicModel
         Of the log, and of means over longer blocks, on which the scan runs.
     prior : ndarray
-        (2, `SIZE`), see `fit`.
-    near : ndarray, optional
-        Where to begin; what is expected by default.
+        (2, `SIZE`), see `fit`; what is expected is where the search begins.
     """
     rough, fine = Likelihood(coarse), Likelihood(tie)
-    start = prior[0] if near is None else near
+    start = prior[0]
     best = fit(rough, start, prior)
     # one instrument is wrong more often than several
     gain, alone = _best_place(rough, start)

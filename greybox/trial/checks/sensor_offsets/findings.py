@@ -8,7 +8,7 @@ What is found is told in words, with its repairs.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -484,7 +484,7 @@ def find_offsets(logs: Sequence[Tied], vessel: Vessel) -> list[tuple[list[Findin
 
 def _campaigns(
     logs: Sequence[Tied], ties: Sequence[KinematicModel], vessel: Vessel
-) -> list[Campaign]:
+) -> Iterator[Campaign]:
     prior, material = expected(vessel), least(vessel)
     first = map_forked(lambda tie: expand(tie, search(tie, coarse_tie(tie), prior)), ties)
     pooled, splits = pool(first, prior, material)
@@ -494,7 +494,6 @@ def _campaigns(
             if len(ties) > 1:
                 evidence[i] = expand(ties[i], campaign.offsets)
     pooled, _ = pool(evidence, prior, material, splits)
-    found = []
     for campaign in pooled:
         members = [ties[i] for i in campaign.logs]
         turned = any(t.turned for t in members)
@@ -505,20 +504,17 @@ def _campaigns(
             scatter=np.hypot(campaign.scatter, material / SIGMAS),
             antenna=prior[0][ARM],
         )  # fmt: skip
-        found.append(
-            Campaign(
-                members=campaign.logs,
-                names=tuple(logs[i].name for i in campaign.logs),
-                recordings=tuple(logs[i].recording for i in campaign.logs),
-                evidence=tuple(evidence[i] for i in campaign.logs),
-                pooled=campaign,
-                judged=_upheld(judged, members, prior),
-                others=len(ties) - len(campaign.logs),
-                turned_over=max(float(np.ptp(t.motion["psi"])) for t in members),
-                step=max(m.step for i in campaign.logs if (m := logs[i].motion) is not None),
-            )
+        yield Campaign(
+            members=campaign.logs,
+            names=tuple(logs[i].name for i in campaign.logs),
+            recordings=tuple(logs[i].recording for i in campaign.logs),
+            evidence=tuple(evidence[i] for i in campaign.logs),
+            pooled=campaign,
+            judged=_upheld(judged, members, prior),
+            others=len(ties) - len(campaign.logs),
+            turned_over=max(float(np.ptp(t.motion["psi"])) for t in members),
+            step=max(m.step for i in campaign.logs if (m := logs[i].motion) is not None),
         )
-    return found
 
 
 def _upheld(judged: list[Judged], ties: Sequence[KinematicModel], prior: Array) -> list[Judged]:

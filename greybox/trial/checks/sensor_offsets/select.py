@@ -187,7 +187,7 @@ def score_hypotheses(
             taken = basis @ inner @ basis.T @ information
             spread = taken @ covariance @ taken.T
             explained = float(pull @ inner @ pull)
-        defects = _defects(h, estimate + null, spread)
+        defects = tuple(_defects(h, estimate + null, spread))
         cost = _cost(h, defects, vessel)
         score = 0.5 * (explained - whole) - cost
         found.append(Judged(h, score, cost, estimate + null, spread, defects))
@@ -229,23 +229,19 @@ def _same(one: Defect, two: Defect) -> bool:
     return one.id == two.id and one.channels == two.channels
 
 
-def _defects(h: Hypothesis, offsets: Array, covariance: Array) -> tuple[Defect, ...]:
-    found = []
+def _defects(h: Hypothesis, offsets: Array, covariance: Array) -> Iterator[Defect]:
     for clock in h.clocks[1:]:
         column = _lateness(clock) - _lateness(h.clocks[0])
-        found.append(
-            Defect(
-                "clock_offset", _channels(clock), _channels(h.clocks[0]),
-                np.array([column @ offsets]), np.array([[column @ covariance @ column]]),
-            )
+        yield Defect(
+            "clock_offset", _channels(clock), _channels(h.clocks[0]),
+            np.array([column @ offsets]), np.array([[column @ covariance @ column]]),
         )  # fmt: skip
     if h.arm:
-        found.append(Defect("lever_arm", POSITIONS, (), offsets[ARM], covariance[ARM, ARM]))
+        yield Defect("lever_arm", POSITIONS, (), offsets[ARM], covariance[ARM, ARM])
     if h.bias:
         bias = np.array([np.angle(np.exp(1j * offsets[BIAS]))])
         variance = covariance[BIAS : BIAS + 1, BIAS : BIAS + 1]
-        found.append(Defect("heading_bias", ("psi",), (), bias, variance))
-    return tuple(found)
+        yield Defect("heading_bias", ("psi",), (), bias, variance)
 
 
 def _lateness(clock: Clock) -> Array:
