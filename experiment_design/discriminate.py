@@ -76,16 +76,14 @@ class Discrimination(DisplayMixin):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON: those of the design, and the discrimination."""
-        a, b = self.names
         return self.design.to_dict() | {
             "criterion": "T",
             "discrimination": {
                 "between": list(self.names),
-                "log_likelihood_ratio": {a: self.ratio[0], b: self.ratio[1]},
-                "log_likelihood_ratio_refitted": {
-                    a: self.ratio_refitted[0],
-                    b: self.ratio_refitted[1],
-                },
+                "log_likelihood_ratio": dict(zip(self.names, self.ratio, strict=True)),
+                "log_likelihood_ratio_refitted": dict(
+                    zip(self.names, self.ratio_refitted, strict=True)
+                ),
                 "nested": self.nested,
                 "best_random": self.random,
                 "probability_right": self.probability,

@@ -228,17 +228,9 @@ class CauseDesign:
         """Return the fields for JSON: those of the design, and the power of causes and pairs."""
         named = (("", self.plan), ("_random", self.random), ("_usual", self.usual))
 
-        def power(i: int, j: int | None = None) -> dict[str, float | None]:
+        def each(name: str, numbers: str, place: int | tuple[int, int]) -> dict[str, float | None]:
             return {
-                f"power{of}": None
-                if r is None
-                else float(r.power[i] if j is None else r.pairs[i, j])
-                for of, r in named
-            }
-
-        def share(i: int) -> dict[str, float | None]:
-            return {
-                f"detectable_share{of}": None if r is None else finite(r.detectable_share[i])
+                f"{name}{of}": None if r is None else finite(getattr(r, numbers)[place])
                 for of, r in named
             }
 
@@ -257,13 +249,16 @@ class CauseDesign:
                         }
                         for i, s in zip(c.tested, c.size, strict=True)
                     },
-                    **power(i),
-                    **share(i),
+                    **each("power", "power", i),
+                    **each("detectable_share", "detectable_share", i),
                 }
                 for i, c in enumerate(self.causes)
             ],
             "pairs": [
-                {"ids": [self.causes[i].id, self.causes[j].id], **power(i, j)}
+                {
+                    "ids": [self.causes[i].id, self.causes[j].id],
+                    **each("power", "pairs", (i, j)),
+                }
                 for i in range(len(self.causes))
                 for j in range(i)
             ],

@@ -5,25 +5,13 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import resources
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
-COLUMNS = (
-    "table",
-    "set",
-    "estimator",
-    "parameter",
-    "mean",
-    "sd",
-    "published_mean",
-    "published_sd",
-    "runs",
-)
 
 
 @dataclass(frozen=True)
@@ -63,10 +51,10 @@ def normalised(estimates: Array, true: float, reference: float | None = None) ->
 
 
 def to_csv(rows: Iterable[Row]) -> str:
-    """Return the rows as CSV with the columns of `COLUMNS`."""
+    """Return the rows as CSV, a column for each field."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    writer.writerow([f.name for f in fields(Row)])
     for r in rows:
         writer.writerow(
             [
