@@ -15,6 +15,7 @@ from greybox.commands.common import (
     VESSEL_HELP,
     add_cluster,
     add_seed,
+    at_least_one,
     count,
     positive,
     progress,
@@ -126,19 +127,11 @@ def _floats(text: str) -> list[float]:
     return values
 
 
-def _whole(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise ValueError(text)
-    return value
-
-
 for _type, _name in (
     (_pair, "two finite numbers A,B"),
     (_not_negative, "number of at least 0"),
     (_share, "number between 0 and 1"),
     (_floats, "finite numbers separated by commas"),
-    (_whole, "whole number of at least 1"),
 ):
     _type.__name__ = _name
 
@@ -269,7 +262,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
          "--after the end of the last log)"),
     )  # fmt: skip
     motion.add_argument(
-        "--trials", type=_whole, default=1, metavar="K", help="number of trials (1)"
+        "--trials", type=at_least_one, default=1, metavar="K", help="number of trials (1)"
     )
     motion.add_argument("--area", metavar="CSV", help="sea room: the corners x_n, y_n [m]")
     _declare(
@@ -340,7 +333,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     work.add_argument(
         "--effort", type=positive, default=1.0, help="multiply the length of the search by this (1)"
     )
-    work.add_argument("--workers", type=_whole, metavar="N", help="number of processes (as needed)")
+    work.add_argument(
+        "--workers", type=at_least_one, metavar="N", help="number of processes (as needed)"
+    )
     add_cluster(work)
     add_seed(work)  # type: ignore[arg-type]
 
@@ -353,15 +348,13 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.semi_empirical import semi_empirical_model
     from greybox.vessel.toml import load_vessel
 
-    legs = None
     if options.legs is not None:
-        from experiment_design.output.legs_file import csv_path, legs_path
+        from experiment_design.output.legs_file import legs_path
 
-        legs = legs_path(options.legs, options.out)
-        options.legs = str(legs)
-    twin = None if legs is None else csv_path(legs)
+        options.legs = str(legs_path(options.legs, options.out))
+    legs = _legs_files(options)
     check_targets(
-        options.out, options.json, options.sheet, options.report, legs, twin, options.save_model
+        options.out, options.json, options.sheet, options.report, *legs, options.save_model
     )
     if options.sheet:
         from experiment_design.output.trial_sheet import sheet_kind
@@ -448,9 +441,9 @@ def _deliver(
         say(legs.sentence())
     for note in notes:
         say(f"Note: {note}")
-    for path in (options.out, options.legs, options.sheet, options.report, options.save_model):
-        if path:
-            say(f"wrote {path}")
+    others = (options.sheet, options.report, options.save_model)
+    for path in filter(None, (options.out, *_legs_files(options), *others)):
+        say(f"wrote {path}")
     show_next(after_design(provenance(options), bool(headline)))
 
 
@@ -683,6 +676,15 @@ def _run_between(
     )
     lines = found.summary().splitlines()
     _deliver(options, found.design, found, notes, {}, f"{lines[0]}: {lines[3]}.")
+
+
+def _legs_files(options: argparse.Namespace) -> tuple[Path, ...]:
+    """Return the files that hold the plan as legs."""
+    if options.legs is None:
+        return ()
+    from experiment_design.output.legs_file import csv_path
+
+    return Path(options.legs), csv_path(Path(options.legs))
 
 
 def _legs(options: argparse.Namespace, design: Any) -> tuple[Any, dict[str, Any]]:

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 
 __all__ = [
-    "VESSEL_HELP", "add_cluster", "add_logs", "add_memory", "add_outputs", "add_seed", "complain",
-    "count", "positive", "progress", "provenance", "publish", "read_logs", "say",
-    "show_next",
+    "VESSEL_HELP", "add_cluster", "add_logs", "add_memory", "add_outputs", "add_seed",
+    "at_least_one", "complain", "count", "positive", "progress", "provenance", "publish",
+    "read_logs", "say", "show_next",
 ]  # fmt: skip
 
 # endings of what is no model
@@ -115,6 +115,17 @@ def count(text: str) -> int:
 
 positive.__name__ = "positive number"
 count.__name__ = "whole number of at least 0"
+
+
+def at_least_one(text: str) -> int:
+    """Return a whole number of at least 1, as an option's type."""
+    value = int(text)
+    if value < 1:
+        raise ValueError(text)
+    return value
+
+
+at_least_one.__name__ = "whole number of at least 1"
 
 
 def add_seed(parser: argparse.ArgumentParser) -> None:
@@ -268,7 +279,7 @@ def _paths(given: Any) -> list[str]:
 
 
 def require_apart(options: argparse.Namespace) -> None:
-    """Raise where an output would replace an input or another output.
+    """Raise where an output would replace an input or another output, or a file has no name.
 
     Raises
     ------
@@ -279,13 +290,20 @@ def require_apart(options: argparse.Namespace) -> None:
 
     taken: dict[Path, str] = {}
     for name in _INPUTS:
-        taken |= {Path(p).resolve(): name for p in _paths(getattr(options, name, None))}
+        paths = _paths(getattr(options, name, None))
+        if "" in paths:
+            raise UsageError(f"a file of {name} has an empty name: name a file.")
+        taken |= {Path(p).resolve(): name for p in paths}
     for name in OUTPUTS:
+        option = name.replace("_", "-")
+        if name != "json" and getattr(options, name, None) == "-":
+            raise UsageError(
+                f"--{option} is '-', and only --json writes to standard output: name a file."
+            )
         for path in _paths(getattr(options, name, None)):
             place = Path(path).resolve()
             # a device takes everything
             if place in taken and (place.is_file() or not place.exists()):
-                option = name.replace("_", "-")
                 raise UsageError(
                     f"--{option} would write over '{path}', which {taken[place]} names too: name "
                     f"another file."

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 from greybox.commands.common import add_memory, add_outputs, add_seed, provenance, publish
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator, Sequence
 
+    from greybox.model.model import ManoeuvringModel
     from greybox.report.page import Page
     from greybox.trial.log import TrialLog
+    from greybox.trial.log_files import LogFile
 
 HELP = "compare free runs of models with logs: fit, errors, bands, plots"
 EXAMPLES = """examples:
@@ -50,6 +52,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_seed(parser)
 
 
+def _read_each(
+    files: Sequence[LogFile], models: Sequence[ManoeuvringModel], read: list[str], told: list[str]
+) -> Iterator[list[TrialLog]]:
+    """Yield each log as every model reads it, and tell what a folder or a pattern holds beside."""
+    from greybox.errors import LogError
+    from greybox.trial.convert.read import read_log
+
+    refused: LogError | None = None
+    for file in files:
+        try:
+            logs = [
+                read_log(file.path, m.vessel, states=m.structure.states, gaps=True) for m in models
+            ]
+        except LogError as error:
+            if not file.found:
+                raise
+            refused = refused or error
+            told.append(f"'{file.name}' was left out: {error}")
+        else:
+            read.append(file.path)
+            yield logs
+    if refused is not None and not read:
+        raise refused
+
+
 def run(options: argparse.Namespace) -> None:
     """Read, run, report."""
     from dataclasses import replace
@@ -58,8 +85,8 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets
     from greybox.model.model import load_model
     from greybox.report.next_steps import after_comparison
-    from greybox.trial.checks.check import misnamed_columns
-    from greybox.trial.convert.read import read_log
+    from greybox.selection.prediction import require_distinct
+    from greybox.trial.checks.check import misnamed_columns, require_each_once
     from greybox.trial.log_files import find_logs
     from greybox.trial.stream import estimated_rows
     from greybox.validation.comparison import BYTES, compare_each
@@ -73,13 +100,10 @@ def run(options: argparse.Namespace) -> None:
     names = [n if n not in names[:i] else f"{n} ({i + 1})" for i, n in enumerate(names)]
     named = dict(zip(names, models, strict=True))
     files = find_logs(options.log)
-    columns: Iterable[list[TrialLog]] = (
-        [
-            read_log(file.path, model.vessel, states=model.structure.states, gaps=True)
-            for model in models
-        ]
-        for file in files
-    )
+    require_each_once([file.path for file in files])
+    read: list[str] = []
+    told: list[str] = []
+    columns: Iterable[list[TrialLog]] = _read_each(files, models, read, told)
     whole = None
     if estimated_rows(files) * len(models) * BYTES > options.memory * 2**30:
         from greybox.report.comparison import MOST_LOGS
@@ -88,12 +112,13 @@ def run(options: argparse.Namespace) -> None:
     else:
         # a log that cannot be read is told before the others are compared
         columns = list(columns)
+        require_distinct([logs[0] for logs in columns])
     comparison = compare_each(
         named, columns, heading=options.heading, bands=not options.no_bands, seed=options.seed,
         whole=whole,
     )  # fmt: skip
-    misnamed = (n for m in models for n in misnamed_columns([f.path for f in files], m.vessel))
-    comparison = replace(comparison, notes=tuple(dict.fromkeys(misnamed)))
+    misnamed = (n for m in models for n in misnamed_columns(read, m.vessel))
+    comparison = replace(comparison, notes=tuple(dict.fromkeys((*told, *misnamed))))
     of = [run.log.provenance for run in comparison.runs[0]]
     record = provenance(options) | {"logs": [f"{p.source} {p.sha256[:12]}" for p in of]}
 
@@ -102,6 +127,6 @@ def run(options: argparse.Namespace) -> None:
 
         return comparison_page(comparison, models, record)
 
-    told = comparison.to_dict() | {"provenance": record}
+    result = comparison.to_dict() | {"provenance": record}
     steps = [after_comparison(comparison, models, record)]
-    publish(options, told, comparison.summary(), page, steps)
+    publish(options, result, comparison.summary(), page, steps)

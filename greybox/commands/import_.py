@@ -143,6 +143,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.errors import UsageError, suggestion
     from greybox.files import check_targets, write_json
     from greybox.report.next_steps import after_import
+    from greybox.trial.checks.check import require_each_once
     from greybox.trial.import_files import (
         LOG_SUFFIXES,
         import_files,
@@ -160,6 +161,7 @@ def run(options: argparse.Namespace) -> None:
             f"--fix-also: add one of them, or leave --fix-not out."
         )
     raw = raw_files(options.raw)
+    require_each_once(raw)
     folder = is_folder(raw, options.out)
     if not folder and Path(options.out).suffix.lower() not in ("", *LOG_SUFFIXES):
         raise UsageError(
@@ -180,7 +182,7 @@ def run(options: argparse.Namespace) -> None:
         fix=options.fix,
         fix_also=tuple(options.fix_also),
         fix_not=tuple(options.fix_not),
-        reader={"topics": pairs(options.topic, "--topic", empty=True)} if options.topic else {},
+        reader={"topics": pairs(options.topic, "--topic", "TOPIC=NAME")} if options.topic else {},
         extra=provenance(options),
     )
     if options.json:
@@ -228,7 +230,7 @@ def _windows(given: list[str]) -> dict[str, float]:
     from greybox.errors import UsageError
 
     windows = {}
-    for channel, text in pairs(given, "--smooth").items():
+    for channel, text in pairs(given, "--smooth", "CHANNEL=S").items():
         try:
             windows[channel] = positive(text)
         except ValueError:
@@ -239,8 +241,8 @@ def _windows(given: list[str]) -> dict[str, float]:
     return windows
 
 
-def pairs(given: list[str], option: str, *, empty: bool = False) -> dict[str, str]:
-    """Return KEY=TEXT options as a dictionary.
+def pairs(given: list[str], option: str, form: str = "KEY=TEXT") -> dict[str, str]:
+    """Return KEY=TEXT options as a dictionary; a topic may stand alone.
 
     Raises
     ------
@@ -252,8 +254,8 @@ def pairs(given: list[str], option: str, *, empty: bool = False) -> dict[str, st
     found: dict[str, str] = {}
     for item in given:
         key, sign, text = item.partition("=")
-        if not key.strip() or not (sign or empty):
-            raise UsageError(f"{option} {item} has no value: write {option} KEY=TEXT.")
+        if not key.strip() or not (sign or option == "--topic"):
+            raise UsageError(f"{option} {item} has no value: write {option} {form}.")
         if key.strip() in found:
             raise UsageError(f"{option} gives '{key.strip()}' twice: keep one of them.")
         found[key.strip()] = text.strip()

@@ -110,6 +110,26 @@ def _parse(given: list[str]) -> argparse.Namespace:
     return options
 
 
+def _open_streams() -> None:
+    """Give closed streams a place to write, and all a way to show what they cannot encode."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+        elif reconfigure := getattr(getattr(sys, name), "reconfigure", None):
+            reconfigure(errors="backslashreplace")
+
+
+def _require_utf8(given: Sequence[str]) -> None:
+    for word in given:
+        try:
+            word.encode()
+        except UnicodeEncodeError as error:
+            raise UsageError(
+                f"'{word}' has bytes that are no UTF-8, the first is number {error.start + 1}, so "
+                f"no output could name it: give the file another name."
+            ) from None
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line, by default that of the process, and return its exit status.
 
@@ -118,17 +138,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if "_ARGCOMPLETE" in os.environ:
         offer(build_parser())
     name, vessel = "greybox", "V"
+    _open_streams()
     try:
-        options = _parse(list(sys.argv[1:] if arguments is None else arguments))
-        name, vessel = f"greybox {options.command}", getattr(options, "vessel", None) or "V"
-        with telling(options.verbose + getattr(options, "more_verbose", 0), options.quiet):
-            _run(options)
+        given = list(sys.argv[1:] if arguments is None else arguments)
+        try:
+            _require_utf8(given)
+            options = _parse(given)
+            name, vessel = f"greybox {options.command}", getattr(options, "vessel", None) or "V"
+            with telling(options.verbose + getattr(options, "more_verbose", 0), options.quiet):
+                _run(options)
+        finally:
+            # what a full disk refuses is told here, and not when the interpreter ends
+            sys.stdout.flush()
     except GreyboxError as error:
         told = str(error).replace("--vessel V ", f"--vessel {shlex.quote(vessel)} ")
         complain(f"{name}: {told}")
         return 1
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        if error.filename is None:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        what = f"use '{error.filename}'" if error.filename else "write an output"
+        complain(f"{name}: cannot {what}: {error.strerror}. Mend that, or name another place.")
         return 1
     except KeyboardInterrupt:
         complain("greybox: stopped")

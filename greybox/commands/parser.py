@@ -17,6 +17,8 @@ from greybox.errors import ConfigurationError, suggestion
 _SENTENCES = {
     r"argument (\S+): not allowed with argument (\S+)$":
         r"\2 and \1 exclude one another: keep one of them",
+    r"argument (--\S+): expected (at least )?one argument$":
+        r"\1 has no value: write it behind, joined by = where it begins with a minus (\1=-1)",
     r"invalid (.*) value: ('.*'|\".*\")$": r"\2 is no \1",
     "is no float$": "is no number",
     "is no int$": "is no whole number",

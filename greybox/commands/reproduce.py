@@ -3,9 +3,20 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
-from greybox.commands.common import add_cluster, add_seed, positive, progress, provenance, say
+from greybox.commands.common import (
+    add_cluster,
+    add_seed,
+    at_least_one,
+    positive,
+    progress,
+    provenance,
+    say,
+)
 
 HELP = "repeat the studies of the thesis, of the estimators' efficiency and of the diagnosis' power"
 EXAMPLES = """examples:
@@ -42,10 +53,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--structure", metavar="NAME", help="chapter 7: structure (thesis)")
     parser.add_argument(
-        "--workers", type=int, metavar="N", help="number of processes (one per core)"
+        "--workers", type=at_least_one, metavar="N", help="number of processes (one per core)"
     )
     add_cluster(parser)
     add_seed(parser)
+
+
+# what only the logs of chapter 7 need
+_OF_LOGS = ("estimate", "validate", "vessel", "sample_time", "structure")
+
+
+@contextmanager
+def _folder(path: str | None) -> Iterator[None]:
+    """Make the folder before the study runs, and take it away where nothing came of it."""
+    from greybox.files import make_folder
+
+    new = path is not None and not Path(path).exists()
+    if path is not None:
+        make_folder(path)
+    try:
+        yield
+    except BaseException:
+        if path is not None and new:
+            with suppress(OSError):
+                Path(path).rmdir()
+        raise
 
 
 def run(options: argparse.Namespace) -> None:
@@ -54,12 +86,22 @@ def run(options: argparse.Namespace) -> None:
 
     if options.runs is None:
         options.runs = 3 if options.study == "power" else 500
-    if options.runs < (1 if options.study == "power" else 2):
+    if options.study == "power" and options.runs < 1:
+        raise UsageError(f"--runs is {options.runs}, each effect needs at least 1 trial.")
+    if options.study != "power" and options.runs < 2:
         raise UsageError(f"--runs is {options.runs}, a standard deviation needs at least 2 runs.")
-    if options.study != "chapter7" and (options.estimate or options.validate or options.vessel):
+    given = [n.replace("_", "-") for n in _OF_LOGS if getattr(options, n) is not None]
+    if options.study != "chapter7" and given:
         raise UsageError(
-            f"--estimate, --validate and --vessel belong to chapter7, not to {options.study}."
+            f"{', '.join(f'--{n}' for n in given)}: these belong to chapter7, not to "
+            f"{options.study}: leave them out."
         )
+    with _folder(options.out):
+        _run(options)
+
+
+def _run(options: argparse.Namespace) -> None:
+    from greybox.errors import UsageError
     from greybox.report import studies
 
     record = provenance(options)
@@ -126,6 +168,7 @@ def _chapter7(options: argparse.Namespace):  # type: ignore[no-untyped-def]
     from greybox.commands.common import read_logs
     from greybox.errors import UsageError
     from greybox.model.catalogue import structure_for
+    from greybox.selection.prediction import require_distinct, require_others
     from greybox.study.chapter7 import reproduce_chapter7, virtual_day
     from greybox.vessel.force import force_inputs
     from greybox.vessel.toml import load_vessel
@@ -133,10 +176,18 @@ def _chapter7(options: argparse.Namespace):  # type: ignore[no-untyped-def]
     given = (options.estimate, options.validate, options.vessel)
     if any(given) and not all(given):
         raise UsageError("chapter7 on logs needs --vessel, --estimate and --validate together.")
+    if options.sample_time is not None and not any(given):
+        raise UsageError(
+            "--sample-time decimates logs, and none is named: add --vessel, --estimate and "
+            "--validate, or leave it out."
+        )
     if all(given):
         vessel = load_vessel(options.vessel)
         estimation, left_out = read_logs(options.estimate, vessel, options.sample_time)
         validation, also = read_logs(options.validate, vessel, options.sample_time)
+        require_distinct(estimation)
+        require_distinct(validation)
+        require_others(estimation, validation)
         for note in (*left_out, *also):
             say(f"note: {note}")
     else:

@@ -120,5 +120,6 @@ def run(options: argparse.Namespace) -> None:
     for note in (*gaps, *notes, *(d.sentence for d in other_conditions(model.conditions, [log]))):
         say(f"note: {note}")
     if not fill:
-        say(f"free run of {len(result.log)} samples, fit {shown}")
+        start = "from the mean of the log's first 5 samples"
+        say(f"free run of {len(result.log)} samples {start}, fit {shown}")
     say(f"wrote {options.out}")

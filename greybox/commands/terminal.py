@@ -123,6 +123,8 @@ def telling(verbose: int, quiet: bool) -> Iterator[None]:
     teller = _Teller()
     teller.lines = verbose > 0
     with ExitStack() as undo:
+        # where it keeps its fonts is nothing that a user asked for
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
         for logger in map(logging.getLogger, LOGGERS if verbose or sys.stderr.isatty() else ()):
             undo.callback(logger.setLevel, logger.level)
             undo.callback(logger.removeHandler, teller)

@@ -130,6 +130,31 @@ def test_a_plan_of_commands_is_simulated_from_a_start(noisy_csv, tmp_path, capsy
         (["diagnose", "{log}", "{log}", "--vessel", "thesis"], "name each trial once"),
         (["reproduce", "chapter4", "--runs", "1"], "needs at least 2 runs"),
         (["reproduce", "chapter4", "--estimate", "x"], "belong to chapter7"),
+        (["reproduce", "chapter6", "--sample-time", "2"], "--sample-time: these belong to chapter"),
+        (["reproduce", "chapter4", "--out", "{log}"], "cannot make the folder"),
+        (["reproduce", "power", "--runs", "0"], "each effect needs at least 1 trial"),
+        (["reproduce", "chapter7", "--sample-time", "2"], "and none is named"),
+        (
+            [
+                "reproduce",
+                "chapter7",
+                "--estimate",
+                "{log}",
+                "--validate",
+                "{log}",
+                "--vessel",
+                "thesis",
+            ],
+            "cannot judge it",
+        ),
+        (["import", "{log}", "{log}", "--vessel", "thesis", "--out", "x.csv"], "named 2 times"),
+        (
+            ["import", "{log}", "--vessel", "thesis", "--out", "x.csv", "--smooth", "r"],
+            "write --smooth CHANNEL=S.",
+        ),
+        (["estimate", "", "--vessel", "thesis"], "a file of logs has an empty name"),
+        (["check", "{log}", "--vessel", ""], "a file of vessel has an empty name"),
+        (["check", "{log}", "--vessel", "thesis", "--report", "-"], "only --json writes to"),
         (["reproduce", "chapter7", "--estimate", "x"], "together"),
     ],
 )
@@ -140,6 +165,12 @@ def test_input_at_fault_is_one_sentence(noisy_csv, capsys, arguments, message):
     assert message in error
     assert error.count("\n") == 1
     assert "Traceback" not in error
+
+
+def test_a_folder_of_a_study_that_came_to_nothing_is_taken_away(noisy_csv, tmp_path):
+    given = ["--estimate", noisy_csv, "--validate", noisy_csv, "--vessel", "thesis"]
+    assert run("reproduce", "chapter7", *given, "--out", tmp_path / "c7") == 1
+    assert not (tmp_path / "c7").exists()
 
 
 def test_nothing_is_left_half_written(noisy_csv, tmp_path, capsys):

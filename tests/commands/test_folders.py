@@ -65,6 +65,24 @@ def test_a_folder_is_compared_and_checked_file_by_file(folder, tmp_path):
     assert len(json.loads(out.read_text())["logs"]) == 3
 
 
+def test_a_comparison_counts_each_trial_once_and_names_what_is_no_log(folder, tmp_path, capsys):
+    model, log = tmp_path / "m.json", folder / "day0.csv"
+    main(["estimate", str(log), *OPTIONS, "--out", str(model)])
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    given = ["compare", str(model), "--no-bands", "--log"]
+    (logs / "run.csv").write_text("t,u\n0,1\n1,2\n2,3\n")
+    assert main([*given, str(logs)]) == 1
+    (logs / "first.csv").write_bytes(log.read_bytes())
+    capsys.readouterr()
+    assert main([*given, str(logs)]) == 0
+    assert "note: 'run.csv' was left out: " in capsys.readouterr().out
+    assert main([*given, str(log), str(log)]) == 1
+    assert "'day0.csv' is named 2 times" in capsys.readouterr().err
+    assert main([*given, str(log), str(logs / "first.csv")]) == 1
+    assert "'day0' and 'first' hold the same 400 samples" in capsys.readouterr().err
+
+
 def test_a_folder_beyond_the_memory_is_compared_with_the_same_numbers(
     folder, tmp_path, monkeypatch
 ):

@@ -134,6 +134,9 @@ def test_the_parser_imports_nothing_heavy():
         ),
         ("predict model.json", "manoeuvre is missing: the manoeuvre to predict (turning, zigzag, "),
         ("completion bsh", "Did you mean 'bash'?"),
+        ("simulate m.json a.csv --out c --start -1,0,0,0", "--start has no value: write it behind"),
+        ("compare m.json --log", "--log has no value: write it behind"),
+        ("reproduce chapter4 --workers -2", "'-2' is no whole number of at least 1."),
     ],
 )
 def test_wrong_usage_is_one_sentence_with_the_nearest_name(capsys, line, message):
@@ -387,6 +390,38 @@ def test_a_folder_that_was_deleted_is_one_sentence(tmp_path, monkeypatch, capsys
     with pytest.raises(SystemExit) as ended:
         main(["check", "--help"])
     assert ended.value.code == 0
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full device")
+@pytest.mark.parametrize("line", ["check trial.csv --vessel ship.toml", "check --help",
+                                  "check trial.csv --vessel ship.toml --json -"])  # fmt: skip
+def test_a_full_disk_is_one_sentence(folder, line):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([*SCRIPT, *line.split()], stdout=full, stderr=subprocess.PIPE,
+                              text=True, cwd=folder)  # fmt: skip
+    assert done.returncode == 1
+    assert "cannot write an output: No space left on device." in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_closed_and_poor_streams_end_no_command(folder):
+    check = f"{shlex.join(SCRIPT)} check trial.csv --vessel ship.toml"
+    for ending in (">&-", "2>&-"):
+        done = subprocess.run(f"{check} {ending}", shell=True, capture_output=True, cwd=folder)
+        assert done.returncode == 0, done.stderr
+    done = subprocess.run([*SCRIPT, "reproduce", "--help"], capture_output=True, text=True,
+                          env=plain_environment(PYTHONIOENCODING="ascii"))  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "Cram\\xe9r" in done.stdout
+
+
+def test_a_name_that_no_output_could_hold_is_refused(tmp_path, capsys):
+    name = tmp_path / "F\udce4hrt.csv"
+    assert main(["import", str(name), "--vessel", "thesis", "--out", str(tmp_path / "o.csv")]) == 1
+    error = capsys.readouterr().err
+    assert "bytes that are no UTF-8" in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_names_of_a_damaged_file_break_no_line(tmp_path, monkeypatch, capsys):

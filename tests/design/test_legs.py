@@ -359,4 +359,4 @@ def test_from_the_command_line(folder, monkeypatch, capsys, options, duration) -
     assert sum(leg["expected"] for leg in written["legs"]) == pytest.approx(duration, rel=0.1)
     said = capsys.readouterr()
     assert "as legs, of which" in said.out + said.err
-    assert "wrote plan.legs.json" in said.out + said.err
+    assert "wrote plan.legs.json\nwrote plan.legs.csv\n" in said.out + said.err
