@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -43,22 +44,12 @@ _LEFT = -1000.0
 # coordinates, whose third decimal (a thousandth of a point) no screen and no printer shows
 _PLACES = re.compile(r' d="[^"]*"| [xy]="[^"]*"|translate\([^)]*\)')
 _LONG = re.compile(r"-?\d+\.\d{3,}")
-
-
-# markers of one look, one after the other
-_MARKS = re.compile(
-    r'<g( clip-path="[^"]*")>( <use [^>]* style="([^"]*)"/>(?: <use [^>]* style="\3"/>)+) </g>'
-)
-
-
-def _styled_once(found: re.Match[str]) -> str:
-    """Return a group of markers with their style written once, where they inherit it."""
-    clip, marks, style = found.groups()
-    # opacity of a group is not that of each of its members
-    if re.search(r"(^|\s)opacity:", style):
-        return found[0]
-    plain = marks.replace(f' style="{style}"', "")
-    return f'<g{clip} style="{style}">{plain} </g>'
+_UNREAD = re.compile(r"<!--.*?-->|<metadata>.*?</metadata>")
+_OWN = re.compile(r'<path id="([^"]+)"[^>]* style="([^"]*)"/>')
+_USE = re.compile(r'(<use xlink:href="#([^"]+)"[^>]*?) style="([^"]*)"(?=/>)')
+_STYLED = re.compile(r' style="([^"]*)"')
+# as the names of marks and of clipped areas are made
+_HASH = re.compile(r"[mp][0-9a-f]{10}")
 
 
 def _rounded(found: re.Match[str]) -> str:
@@ -352,14 +343,32 @@ def to_svg(figure: Figure, title: str) -> str:
     text = out.getvalue()
     text = text[text.index("<svg") :]
     text = _PLACES.sub(lambda found: _LONG.sub(_rounded, found[0]), text)
-    text = re.sub(r"\s*\n\s*", " ", text)
-    text = _MARKS.sub(_styled_once, text)
-    text = text.replace("DejaVuSans-", "")
-    # identifiers are local to a page with many figures
-    prefix = re.sub(r"\W", "", title)[:24]
-    text = re.sub(r'\bid="([^"]+)"', rf'id="{prefix}-\1"', text)
-    text = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{prefix}-", text)
-    return text
+    text = re.sub(r"\s*\n\s*", " ", text).replace("DejaVuSans-", "")
+    return _lighter(text, re.sub(r"\W", "", title)[:24])
+
+
+def _lighter(text: str, prefix: str) -> str:
+    """Return an SVG without what nothing reads, its names local to a page with many figures."""
+    text = _UNREAD.sub("", text).replace("> <", "><")
+    own = dict(_OWN.findall(text))
+    # a mark has its own style, wherever it is used
+    text = _USE.sub(lambda use: use[1] if own.get(use[2]) == use[3] else use[0], text)
+    # looks that several parts have are written once
+    count = Counter(_STYLED.findall(text))
+    looks = {look: f"s{k}-{prefix}" for k, look in enumerate(count) if count[look] > 2}
+    sheet = "".join(f".{name}{{{look}}}" for look, name in looks.items())
+    text = _STYLED.sub(
+        lambda m: f' class="{looks[m[1]]}"' if m[1] in looks else m[0], text
+    ).replace("</style>", f"{sheet}</style>", 1)
+    names = {n: n for n in re.findall(r'(?:href="#|url\(#)([^")]+)', text)}
+    hashes = [n for n in names if _HASH.fullmatch(n)]
+    names |= {n: f"{n[0]}{k}" for k, n in enumerate(hashes)}
+
+    def name(found: re.Match[str]) -> str:
+        return f'{found[1]}{prefix}-{names[found[2]]}"' if found[2] in names else ""
+
+    text = re.sub(r'( id=")([^"]+)"', name, text)
+    return re.sub(r'((?:href="#|url\(#))([^")]+)', lambda m: f"{m[1]}{prefix}-{names[m[2]]}", text)
 
 
 def save_png(figure: Figure, path: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -43,11 +44,24 @@ def test_values_are_escaped():
 def test_identifiers_of_figures_do_not_collide():
     figures = [overview_figure({"u": np.arange(5.0)}, "x") for _ in range(2)]
     one, two = (to_svg(f, t) for f, t in zip(figures, ("a", "b"), strict=True))
-    import re
-
     ids = [set(re.findall(r'\bid="([^"]+)"', s)) for s in (one, two)]
     assert ids[0]
     assert not ids[0] & ids[1]
+
+
+def test_a_picture_holds_nothing_that_is_not_read():
+    figure = overview_figure({"u": np.sin(np.arange(50)), "psi": np.arange(50.0)}, "6 <!-- logs")
+    svg = to_svg(figure, "6 logs")
+    names = re.findall(r' id="([^"]+)"', svg)
+    assert set(names) == set(re.findall(r'(?:href="#|url\(#)([^")]+)', svg))
+    assert len(names) == len(set(names))
+    assert "<!--" not in svg
+    # every look that is named is there, under a name that a style sheet may have
+    named = set(re.findall(r'class="([^"]+)"', svg))
+    assert named
+    assert named == set(re.findall(r"\.(s[^{]+)\{", svg))
+    styles = re.findall(r' style="([^"]*)"', svg)
+    assert all(styles.count(look) < 3 for look in styles)
 
 
 def test_comparison_figure_has_labels_and_units(clean_log, thesis, true_theta):
