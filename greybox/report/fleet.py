@@ -23,6 +23,7 @@ from greybox.report.figures import (
     tidy,
     to_svg,
 )
+from greybox.report.model_difference import shown_unit
 from greybox.report.next_steps import after_fleet
 from greybox.report.page import Page, Picture, Section, Table, computed
 
@@ -133,7 +134,7 @@ def _class_section(fleet: Fleet) -> Section:
             f"{_number(intervals[j, 0])} to {_number(intervals[j, 1])}",
             _number(float(np.sqrt(pooled.omega[j])), ".2g"),
             f"{pooled.shrinkage[:, j].mean():.2f}",
-            fleet.units[j],
+            shown_unit(fleet.units[j]),
         ]
         for j, name in enumerate(fleet.names)
     ]
@@ -267,7 +268,8 @@ def _trend_figure(ship: ShipEstimate, trend: Trend, j: int, name: str, unit: str
     axes.errorbar(times, value, yerr=error, fmt="o", color=BLACK, markersize=4, capsize=3,
                   linewidth=1, label="period")  # fmt: skip
     axes.set_xlabel("year" if ship.dated else "log, in the order of names", fontsize=8.5)
-    axes.set_ylabel(f"{name} [{unit}]", fontsize=8.5, parse_math=False)
+    label = f"{name} [{shown_unit(unit)}]".removesuffix(" []")
+    axes.set_ylabel(label, fontsize=8.5, parse_math=False)
     axes.ticklabel_format(axis="x", useOffset=False)
     axes.tick_params(labelsize=8)
     axes.legend(fontsize=8, loc="best")

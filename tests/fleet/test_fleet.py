@@ -18,6 +18,7 @@ from greybox.errors import LogError, VesselError
 from greybox.fleet.differing import least_deviation
 from greybox.fleet.ships import find_ships
 from greybox.fleet.trend import fit_trend
+from greybox.report.fleet import fleet_page
 from greybox.vessel.toml import example_vessel
 
 
@@ -162,3 +163,10 @@ def test_the_command_leaves_out_what_cannot_be_read_and_does_the_rest(sailed, ca
     assert len(rows) == 3 * len(data["names"])
     assert float(rows[0]["pooled"]) == pytest.approx(data["ships"][0]["pooled"][0])
     assert "Ship &#39;d&#39; was left out" in page.read_text()
+
+
+def test_units_on_the_page_are_those_of_other_pages():
+    page = fleet_page(planted(change=0.03), {})
+    units = {row[0]: row[-1] for row in page.sections[0].tables[0].rows}
+    assert (units["Nr"], units["Nuv"]) == ("", "s/m²")
+    assert page.sections[2].pictures[0].chart.panels[0].y_label == "Nr"
