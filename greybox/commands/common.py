@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "VESSEL_HELP", "add_cluster", "add_logs", "add_memory", "add_outputs", "add_seed",
-    "at_least_one", "complain", "count", "positive", "progress", "provenance", "publish",
-    "read_logs", "say", "show_next",
+    "at_least_one", "complain", "configured", "count", "leave_to_others", "positive",
+    "progress", "provenance", "publish", "read_logs", "say", "show_next",
 ]  # fmt: skip
 
 # endings of what is no model
@@ -276,6 +276,23 @@ def _paths(given: Any) -> list[str]:
     """Return what an option names as files."""
     several = given if isinstance(given, (list, tuple)) else [given]
     return [g for g in several if isinstance(g, str) and g != "-"]
+
+
+def configured(options: argparse.Namespace) -> list[str]:
+    """Return the options that the configuration file gives; what is removed is not recorded."""
+    return (getattr(options, "configuration", None) or {"options": []})["options"]
+
+
+def leave_to_others(options: argparse.Namespace, name: str, default: Any) -> bool:
+    """Take back an option that only the configuration file gives; return whether it was one.
+
+    What stands there for other uses of a command is no mistake of this one.
+    """
+    if name not in (given := configured(options)):
+        return False
+    given.remove(name)
+    setattr(options, name, default)
+    return True
 
 
 def require_apart(options: argparse.Namespace) -> None:

@@ -12,6 +12,8 @@ from greybox.commands.common import (
     add_memory,
     add_outputs,
     add_seed,
+    configured,
+    leave_to_others,
     positive,
     progress,
     provenance,
@@ -281,7 +283,12 @@ def _require_heeded(options: argparse.Namespace) -> None:
     for methods, names in _ONLY.items():
         for name in names if options.method not in (None, *methods) else ():
             # measured is how it is done where nothing is asked for
-            if getattr(options, name) not in (parser.get_default(name), "measured"):
+            if getattr(options, name) in (parser.get_default(name), "measured"):
+                continue
+            # a method that is typed wins over a file, one that the file names contradicts it
+            if "method" in configured(options) or not leave_to_others(
+                options, name, parser.get_default(name)
+            ):
                 raise UsageError(
                     f"--{name.replace('_', '-')} applies to --method {' and '.join(methods)} "
                     f"only, but --method is {options.method}: leave one of them out."

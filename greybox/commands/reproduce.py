@@ -12,6 +12,7 @@ from greybox.commands.common import (
     add_cluster,
     add_seed,
     at_least_one,
+    leave_to_others,
     positive,
     progress,
     provenance,
@@ -90,8 +91,12 @@ def run(options: argparse.Namespace) -> None:
         raise UsageError(f"--runs is {options.runs}, each effect needs at least 1 trial.")
     if options.study != "power" and options.runs < 2:
         raise UsageError(f"--runs is {options.runs}, a standard deviation needs at least 2 runs.")
+    others = options.study != "chapter7"
+    unheeded = _OF_LOGS if others else ("vessel", "sample_time")
+    for name in unheeded if others or not (options.estimate or options.validate) else ():
+        leave_to_others(options, name, None)
     given = [n.replace("_", "-") for n in _OF_LOGS if getattr(options, n) is not None]
-    if options.study != "chapter7" and given:
+    if others and given:
         raise UsageError(
             f"{', '.join(f'--{n}' for n in given)}: these belong to chapter7, not to "
             f"{options.study}: leave them out."

@@ -9,6 +9,7 @@ from virtual import virtual_log, write_csv
 
 from greybox.commands.configuration import MOST_BYTES, find_configuration
 from greybox.commands.main import build_parser, main
+from greybox.errors import GreyboxError
 from greybox.files import sha256
 from greybox.vessel.toml import example_vessel
 
@@ -68,6 +69,25 @@ def test_the_command_line_wins(folder, options):
     given = options("estimate", "trial.csv", "--compare-structures", "thesis", "linear")
     assert given.reduce is False
     assert given.compare_structures == ["thesis", "linear"]
+
+
+def test_what_a_use_of_a_command_does_not_heed_may_stand_for_others(folder, capsys, monkeypatch):
+    def stop(options):
+        raise GreyboxError(f"goes on with {', '.join(options.configuration['options'])}")
+
+    monkeypatch.setattr("greybox.commands.reproduce._run", stop)
+    write(folder, '[all]\nvessel = "ship.toml"\nsample-time = 2\nseed = 3\n')
+    for study in ("chapter4", "chapter7"):
+        assert main(["reproduce", study]) == 1
+        assert capsys.readouterr().err == "greybox reproduce: goes on with seed\n"
+    bounded = '[estimate]\nvessel = "ship.toml"\nbound = "Xu=-1:0"\n'
+    for more, word in (("", "there is no file"), ('method = "oe"\n', "there is no file")):
+        write(folder, bounded + more)
+        assert main(["estimate", "none.csv", "--method", "ls"]) == 1
+        assert word in capsys.readouterr().err
+    write(folder, bounded + 'method = "ls"\n')
+    assert main(["estimate", "none.csv"]) == 1
+    assert "--bound applies to --method oe only" in capsys.readouterr().err
 
 
 def test_options_that_repeat_are_replaced_as_a_whole(folder, options):
