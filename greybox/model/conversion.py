@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from greybox.errors import StructureError
 from greybox.model.structure import Structure
@@ -109,21 +110,50 @@ def estimate_inertia(
     Raises
     ------
     StructureError
-        An input gain is missing or zero.
+        An input gain is missing, zero or negative: no mass is.
 
     References
     ----------
     Ljungberg (2020), Table 3.1.
     """
     gains = {n: theta.get(n, 0.0) for n in ("Xmu", "Ymu", "Nmu")}
-    zero = [n for n, g in gains.items() if g == 0.0]
-    if zero:
-        raise StructureError(
-            f"the inertias follow from the input gains Xmu, Ymu and Nmu, and {zero[0]} is "
-            f"{gains[zero[0]]:g}: the thrusters' own forces show no inertia in that direction."
-        )
+    for name, gain in gains.items():
+        if not gain > 0.0:
+            raise StructureError(
+                f"the inertias follow from the input gains Xmu, Ymu and Nmu, and {name} is "
+                f"{gain:.4g}: "
+                + (
+                    "a force that moves the ship against itself has no inertia. Other terms with "
+                    "inputs take its place, or a thruster has the wrong sign in the vessel file."
+                    if gain < 0.0
+                    else "the thrusters' own forces show no inertia in that direction."
+                )
+            )
     surge = sample_time / gains["Xmu"] if thrust_in_newtons else mass * (1 + SURGE_ADDED_MASS)
     return Inertia(surge, surge * gains["Xmu"] / gains["Ymu"], surge * gains["Xmu"] / gains["Nmu"])
+
+
+def inertia_errors(
+    gains: NDArray[np.float64], covariance: NDArray[np.float64], *, thrust_in_newtons: bool
+) -> Inertia:
+    """Return the standard errors of the inertias of `estimate_inertia`, as shares of them.
+
+    Parameters
+    ----------
+    gains : ndarray
+        (3,) ``Xmu``, ``Ymu`` and ``Nmu``.
+    covariance : ndarray
+        (3, 3) of them.
+    thrust_in_newtons : bool
+        Otherwise surge, of an assumed added mass, has no error.
+    """
+    relative = covariance / np.outer(gains, gains)
+    # of the logarithms of the inertias by those of the gains
+    slopes = -np.eye(3)
+    if not thrust_in_newtons:
+        slopes[:, 0] += 1.0
+    errors = np.sqrt(np.maximum(np.diag(slopes @ relative @ slopes.T), 0.0))
+    return Inertia(*map(float, errors))
 
 
 def check_ties(theta: Mapping[str, float], sample_time: float) -> list[Tie]:

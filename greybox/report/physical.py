@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from greybox.errors import StructureError
 from greybox.model.conversion import (
     SURGE_ADDED_MASS,
     check_ties,
     estimate_inertia,
+    inertia_errors,
     to_continuous,
     to_prime,
 )
@@ -31,6 +34,15 @@ def physical_summary(model: ManoeuvringModel, mass: float, speed: float | None =
         inertia = estimate_inertia(theta, model.sample_time, mass=mass, thrust_in_newtons=newtons)
     except StructureError as error:
         return f"Physical quantities: not available, because {error}"
+    gains = [model.names.index(n) for n in ("Xmu", "Ymu", "Nmu")]
+    errors = inertia_errors(
+        model.theta[gains], model.covariance[np.ix_(gains, gains)], thrust_in_newtons=newtons
+    )
+
+    def shown(state: str, unit: str) -> str:
+        error = 100 * errors.of(state)
+        return f"{inertia.of(state):.4g} {unit}" + (f" ± {error:.2g} %" if error else "")
+
     length = model.vessel.length
     usual = " of a usual Froude number, 0.25" if speed is None else ""
     speed = (9.81 * length) ** 0.5 / 4 if speed is None else speed
@@ -43,8 +55,9 @@ def physical_summary(model: ManoeuvringModel, mass: float, speed: float | None =
     )
     lines = [
         f"Physical quantities for m = {mass:g} kg, {how}:",
-        f"  m − X_u̇ = {inertia.surge:.4g} kg, m − Y_v̇ = {inertia.sway:.4g} kg, "
-        f"I_z − N_ṙ = {inertia.yaw:.4g} kg m²",
+        f"  m − X_u̇ = {shown('u', 'kg')}, m − Y_v̇ = {shown('v', 'kg')}, "
+        f"I_z − N_ṙ = {shown('r', 'kg m²')}"
+        + (" (± one standard error)" if any(map(errors.of, "uvr")) else ""),
         f"  {'coefficient':<14}{'value':>13}{'prime':>13}   (SI; prime with L = {length:g} m, "
         f"U = {speed:.2f} m/s{usual})",
     ]

@@ -24,6 +24,7 @@ from greybox.model.conversion import (
     Inertia,
     check_ties,
     estimate_inertia,
+    inertia_errors,
     to_continuous,
     to_prime,
 )
@@ -295,6 +296,29 @@ def test_masses_follow_from_the_gains():
     assert assumed.surge == pytest.approx(4.2e4)
     with pytest.raises(StructureError, match="Ymu is 0"):
         estimate_inertia({"Xmu": 1, "Nmu": 1}, 1.0, mass=1, thrust_in_newtons=True)
+    with pytest.raises(StructureError, match=r"Ymu is -0\.2: a force that moves the ship against"):
+        estimate_inertia({"Xmu": 1, "Ymu": -0.2, "Nmu": 1}, 1.0, mass=1, thrust_in_newtons=False)
+
+
+def test_errors_of_the_masses_are_those_of_draws_of_the_gains():
+    gains, rng = np.array([2e-5, 1e-5, 1e-7]), np.random.default_rng(1)
+    share = np.array([[1.0, 0.8, 0.0], [0.8, 1.0, 0.0], [0.0, 0.0, 4.0]]) * 1e-4
+    covariance = share * np.outer(gains, gains)
+    draws = rng.multivariate_normal(gains, covariance, 4000)
+    for newtons in (True, False):
+        masses = [
+            estimate_inertia(
+                dict(zip(("Xmu", "Ymu", "Nmu"), g, strict=True)),
+                1.0,
+                mass=4e4,
+                thrust_in_newtons=newtons,
+            )
+            for g in draws
+        ]
+        errors = inertia_errors(gains, covariance, thrust_in_newtons=newtons)
+        for state in "uvr":
+            drawn = np.array([m.of(state) for m in masses])
+            assert errors.of(state) == pytest.approx(drawn.std() / drawn.mean(), rel=0.05, abs=1e-9)
 
 
 def test_ties_of_table_6_1_do_not_hold(thesis, true_theta):
