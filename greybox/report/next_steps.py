@@ -69,9 +69,12 @@ def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextSt
     logs, validate = typed(record, "logs", "LOG…"), typed(record, "validate", "")
     level = estimate.prediction.level if estimate.prediction else PredictionLevel.NOT_JUDGED
     trust = estimate.meant.verdict.level
+    structure = estimate.predictor.structure
+    turns = "r" in structure.states
     steps = []
     if level in _DOUBTED or trust is TrustLevel.DO_NOT_TRUST:
         held = f" --validate {validate}" if validate else ""
+        held += "" if turns else f" --structure {shlex.quote(structure.name)}"
         steps.append(
             NextStep(
                 "Find what the simulation gets wrong, and why",
@@ -82,12 +85,13 @@ def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextSt
     from greybox.prediction.steady import kept_from_straight
 
     helm = find_helm(estimate.vessel)
-    if level is PredictionLevel.GOOD and helm.kind != "none":
-        free = " --no-limits" if kept_from_straight(helm) else ""
+    if level is PredictionLevel.GOOD and not (turns and helm.kind == "none"):
+        kind = "zigzag" if turns else "stopping"
+        free = " --no-limits" if turns and kept_from_straight(helm) else ""
         steps.append(
             NextStep(
                 "Predict manoeuvres of the ship",
-                f"greybox predict {model} zigzag{free} --report zigzag.html",
+                f"greybox predict {model} {kind}{free} --report {kind}.html",
             )
         )
     if level is PredictionLevel.NOT_JUDGED:

@@ -8,15 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from browser import needs_browser, require_legible, without_scripts
+from surge import surge_log
 from virtual import virtual_log
 
 from greybox.commands.main import main
+from greybox.estimation.prediction_verdict import PredictionLevel, PredictionVerdict
 from greybox.estimation.tried import Comparison, TriedModel
 from greybox.estimation.verdict import Divergence, TrustLevel, Verdict, refused
+from greybox.model.catalogue import get_structure
+from greybox.model.predictor import build_predictor
 from greybox.report.estimation import estimation_page, headline
 from greybox.report.estimation_figures import regime_shares
+from greybox.report.next_steps import after_estimate
 from greybox.report.page import computed, render
 from greybox.selection.estimate import estimate_model
+from greybox.selection.fit_single import estimate_ls
 
 HOSTILE = '<script>alert("x")</script> & $x^$'
 
@@ -125,6 +131,19 @@ def test_the_free_run_is_told_of_as_many_logs_as_there_are(estimate, log, page):
         "Of those drawn the one of lowest fit stands at the top of the page.",
     ]
     assert "fits the logs it was estimated on" in told.headline
+
+
+def test_what_comes_next_of_a_model_of_surge_is_what_it_can_do():
+    found = estimate_ls(
+        build_predictor(get_structure("surge"), "basic", (("u", (1,)),)), [surge_log(1, 0.5, 300)]
+    )
+    doubted, good = (
+        replace(found, prediction=PredictionVerdict(level))
+        for level in (PredictionLevel.POOR, PredictionLevel.GOOD)
+    )
+    commands = [s.command for e in (doubted, good) for s in after_estimate(e, {})]
+    assert commands[0].startswith("greybox diagnose LOG… --vessel V --structure surge ")
+    assert commands[-1] == "greybox predict MODEL stopping --report stopping.html"
 
 
 def test_without_tests_the_page_stands(estimate, log):
