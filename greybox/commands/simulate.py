@@ -46,6 +46,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets, replacing
     from greybox.model.model import load_model
     from greybox.model.run.simulation import positions
+    from greybox.trial.checks.check import misnamed_columns
     from greybox.trial.convert.read import read_log
     from greybox.trial.gaps import split_at_gaps
     from greybox.trial.segments import find_log_gaps
@@ -117,7 +118,8 @@ def run(options: argparse.Namespace) -> None:
     if winds and not result.log.has_wind:
         say(f"note: {', '.join(winds)} act as in still air, because the log has no wind")
     gaps = (g.sentence for g in find_log_gaps(result.log))
-    for note in (*gaps, *notes, *(d.sentence for d in other_conditions(model.conditions, [log]))):
+    others = (d.sentence for d in other_conditions(model.conditions, [log]))
+    for note in (*misnamed_columns([options.log], model.vessel), *gaps, *notes, *others):
         say(f"note: {note}")
     if not fill:
         start = "from the mean of the log's first 5 samples"

@@ -286,6 +286,7 @@ def test_columns_in_another_unit_are_told_by_every_command_that_reads_logs(tmp_p
     for command in (
         ["estimate", *known[1], *LEAST, "--out", model],
         ["compare", model, *known[0], "--no-bands"],
+        ["simulate", model, log, "--no-bands", "--out", tmp_path / "run.csv"],
         ["diagnose", *known[1], "--model", model, "--causes", "current"],
     ):
         assert run(*command) == 0
