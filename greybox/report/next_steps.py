@@ -109,7 +109,14 @@ def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextSt
                 f"--duration 900 --out plan.csv",
             )
         )
-    return steps
+    return steps or [_use(model)]
+
+
+def _use(model: str) -> NextStep:
+    """Return what a model is for, where nothing has to be done for it."""
+    return NextStep(
+        "Use it in a program of your own", f"greybox export {model} --to c --out model.c"
+    )
 
 
 def after_check(reports: Sequence[CheckReport], record: Mapping[str, Any]) -> list[NextStep]:
@@ -189,7 +196,7 @@ def after_prediction(
                 f"greybox predict {model} {made.kind} --trial LOG --report beside.html",
             )
         )
-    return steps
+    return steps or [_use(model)]
 
 
 def after_fleet(fleet: Fleet, record: Mapping[str, Any]) -> list[NextStep]:

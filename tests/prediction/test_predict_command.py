@@ -89,6 +89,7 @@ def test_a_trial_beside_it(model, tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "agree: all 8 differences lie within both intervals" in shown
     assert "8 of 8 measured quantities agree" in page.read_text()
+    assert f"greybox export {model} --to c --out model.c" in shown
     assert run("predict", model, "crash", "--trial", out) == 1
     assert "no crash manoeuvre in 'z', but zig-zag 20/20" in capsys.readouterr().err
 
