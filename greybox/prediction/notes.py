@@ -71,7 +71,10 @@ def run_notes(
     else:
         names = [n for n, v in zip(helm.columns, helm.drive, strict=True) if v != 0]
     rates = dict(zip(helm.columns, (x.rate for x in helm.limits), strict=True))
-    instant = [n for n in names if rates[n] is None]
+    late = model.vessel.actuation
+    slow = (late.rate_on, *model.vessel.lagged_commands)
+    forces = late.lag > 0 and late.lag_on == "force"
+    instant = [n for n in names if rates[n] is None and n not in slow and not forces]
     if instant:
         told.append(
             f"the vessel file states no rate of {', '.join(instant)}, so orders are carried out "
@@ -83,9 +86,10 @@ def run_notes(
             f"wrong, in the vessel file or in the log."
         )
     if abs(start.trim) > 1e-6:
-        trim = math.degrees(start.trim) if helm.angular else start.trim
+        trim = abs(math.degrees(start.trim) if helm.angular else start.trim)
         unit = " deg" if helm.angular else ""
-        told.append(f"the straight approach needs a steering order of {trim:.3g}{unit}.")
+        side = "starboard" if start.trim > 0 else "port"
+        told.append(f"the straight approach needs a steering order of {trim:.3g}{unit} to {side}.")
     if isinstance(own, TurningCircle) and own.unsteady:
         told.append(own.unsteady)
     if isinstance(own, Stopping) and own.unfinished:

@@ -200,7 +200,7 @@ def predict_manoeuvre(
         logs = [trial] if isinstance(trial, TrialLog) else list(trial)
         elsewhere = other_conditions(model.conditions, logs)
         found = found_in_trial(manoeuvre, logs, helm, asked)
-        helm, told_rates = with_rates(helm, found)
+        helm, told_rates = with_rates(helm, model.vessel.actuation, found)
         if asked.command:
             helm = driven(helm, model, asked)
         todo = [task for task, _, _ in found]

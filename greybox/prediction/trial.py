@@ -35,6 +35,7 @@ from greybox.trial.manoeuvres.stopping import measure_stopping
 from greybox.trial.manoeuvres.track import make_track, without_antenna
 from greybox.trial.raw_log import shortened
 from greybox.trial.wind import true_wind
+from greybox.vessel.vessel import Actuation
 
 Array = NDArray[np.float64]
 
@@ -303,7 +304,7 @@ def circles(
 
 
 def with_rates(
-    helm: Helm, found: Sequence[tuple[Task, Manoeuvre, TrialLog]]
+    helm: Helm, late: Actuation, found: Sequence[tuple[Task, Manoeuvre, TrialLog]]
 ) -> tuple[Helm, list[str]]:
     """Return a helm whose steering moves as fast as in the trial, and as the vessel file allows.
 
@@ -317,7 +318,9 @@ def with_rates(
         rates = [r for _, m, log in found if name in log for r in _rates(log, name, m)]
         if not rates:
             continue
-        rate, stated = float(np.median(rates)), limits[i].rate
+        rate = float(np.median(rates))
+        own = limits[i].rate, late.rate_limit if name == late.rate_on else None
+        stated = min((r for r in own if r is not None), default=None)
         if stated is not None and rate >= stated:
             continue
         limits[i] = replace(limits[i], rate=rate)

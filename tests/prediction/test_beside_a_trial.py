@@ -147,6 +147,12 @@ def test_the_rate_of_a_helm_is_that_of_its_motion(rate, told):
     log = make_log(log.vessel, dict(log.channels) | {"delta": rounded}, STEP, "trial")
     made = predict_manoeuvre(model, "turning", trial=log, draws=40)
     assert any(f"no rate of delta; it moves {told}" in n for n in made.notes)
+    limited = rudder_model(step=STEP, actuation={"rate_limit": 0.15, "rate_on": "delta"})
+    own = predict_manoeuvre(limited, "turning", trial=log, draws=40)
+    stated = [n.split(" of delta")[0] for n in own.notes if "it moves" in n]
+    assert stated == (
+        [] if rate > 0.15 else ["the vessel file states a rate of 8.59 deg per second"]
+    )
     assert all(q is not None for q in made.manoeuvres[0].quantities.values())
     assert max(errors(made).values()) < 0.05
 

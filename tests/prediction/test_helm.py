@@ -94,6 +94,8 @@ def test_a_lopsided_ship_is_trimmed():
     assert delta < 0
     assert abs(left) < 1e-9
     assert math.hypot(u, v) == pytest.approx(3.0)
+    told = predict_manoeuvre(model, "turning", side="port", speed=3.0, draws=40).summary()
+    assert f"a steering order of {math.degrees(-delta):.3g} deg to port" in told
 
 
 def test_a_speed_out_of_reach_names_the_range():

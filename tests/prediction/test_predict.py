@@ -120,6 +120,23 @@ def test_a_run_is_the_models_own_free_run(actuation, integrator):
             assert np.abs(np.diff(log["delta"])).max() <= 0.2 * 0.05 * (1 + 1e-9)
 
 
+@pytest.mark.parametrize(
+    ("actuation", "instant"),
+    [
+        (None, True),
+        ({"rate_limit": 0.15, "rate_on": "delta"}, False),
+        ({"lag": 0.8, "lag_on": "delta"}, False),
+        ({"lag": 0.8}, False),
+        ({"lag": 0.8, "lag_on": "speed"}, True),
+    ],
+)
+def test_orders_are_not_said_to_act_at_once_where_the_model_delays_them(actuation, instant):
+    made = predict_manoeuvre(
+        rudder_model(actuation=actuation), "zigzag", side="port", angles=[0.3], **FEW
+    )
+    assert ("no rate of delta, so orders are carried out at once" in made.summary()) == instant
+
+
 @pytest.mark.parametrize("kind", ["turning", "zigzag", "crash"])
 def test_the_trials_measuring_finds_the_same(kind):
     """A predicted run, read as a trial, is found and measured alike."""
