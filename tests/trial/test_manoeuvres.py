@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -32,6 +33,7 @@ from greybox.trial.manoeuvres.standards import (
     second_overshoot_limit,
 )
 from greybox.trial.manoeuvres.track import make_track, path_length
+from greybox.trial.steps import Step
 from greybox.trial.trial_summary import describe_logs
 from greybox.vessel.toml import vessel_from_dict
 
@@ -468,6 +470,25 @@ def test_azimuths_steer_too(turn_run):
     (turn,) = find_manoeuvres(log_of(run | {"a1": -delta, "a2": -delta}, ship))
     assert turn.rudder == pytest.approx(20 * DEG, abs=0.5 * DEG)
     assert turn.start == pytest.approx(60, abs=0.5)
+
+
+def test_a_turn_of_an_antenna_that_stands_somewhere_is_said_to_be_the_antennas(turn_run):
+    run = sampled(turn_run, 0.5)
+    c, s = np.cos(run["psi"]), np.sin(run["psi"])
+    run |= {"x_n": run["x_n"] - 30 * c, "y_n": run["y_n"] - 30 * s}
+    made = Step("difference", ("u", "v"), ("x_n", "y_n", "psi"))
+    angles = []
+    for sensors in ({}, {"antenna": [-30.0, 0.0]}):
+        log = log_of(run, rudder_ship(**sensors))
+        assert not any("antenna" in n for n in find_manoeuvres(log)[0].notes)
+        log = replace(log, provenance=replace(log.provenance, steps=(made,)))
+        (turn,) = find_manoeuvres(log)
+        angles.append(math.degrees(turn.drift_angle.value))
+        told = [n for n in turn.notes if "those of the antenna" in n]
+        assert bool(told) == (not sensors)
+        if told:
+            each = float(told[0].split("whose drift angle is ")[1].split(" deg")[0])
+    assert angles[0] - angles[1] == pytest.approx(30 * each, rel=0.1)
 
 
 def test_without_a_rudder_the_yaw_rate_shows_the_turn(turn_run, turn_truth):

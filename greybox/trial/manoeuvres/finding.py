@@ -157,7 +157,24 @@ def find_manoeuvres(log: TrialLog, *, scale: float = 1.0) -> tuple[Manoeuvre, ..
         for stop in _stops(log, signals)
         if not any(m.start < stop.stop and stop.start < m.stop for m in found)
     ]
-    return tuple(sorted(found, key=lambda m: m.start))
+    return tuple(sorted(_of_antenna(found, log), key=lambda m: m.start))
+
+
+def _of_antenna(found: Sequence[Manoeuvre], log: TrialLog) -> Iterator[Manoeuvre]:
+    """Note where turns are those of an antenna that the vessel file does not place."""
+    derived = any(s.derives_motion and {"u", "v"} & {*s.channels} for s in log.provenance.steps)
+    unplaced = derived and "antenna" not in log.vessel.sensors
+    for m in found:
+        if unplaced and isinstance(m, TurningCircle):
+            note = (
+                "u and v were made of what the antenna measures, and the vessel file does not say "
+                "where it is: track, speed and drift angle are those of the antenna"
+            )
+            if m.yaw_rate is not None and m.speed is not None:
+                turned = math.degrees(abs(m.yaw_rate.value) / m.speed.value)
+                note += f", whose drift angle is {turned:.2g} deg larger for each metre abaft"
+            m = replace(m, notes=(*m.notes, f"{note} (add antenna = [x, y] to [sensors])"))
+        yield m
 
 
 def _signals(log: TrialLog) -> _Signals | None:
