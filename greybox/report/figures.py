@@ -38,8 +38,15 @@ LABELS = {
 
 # as sentences call the states
 NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
+# inches: letters stay legible where the page is 390 px wide
+_WIDTH = 5.2
 # fit from which on a run has not left the measurements for good [%]
 _LEFT = -1000.0
+
+# inches that each further row of a legend needs
+LEGEND_ROW = 0.17
+# points: a letter of a legend, what stands before each of its names, and beside the axes
+_LETTER, _HANDLE, _AXIS = 4.9, 24.0, 50.0
 
 # coordinates, whose third decimal (a thousandth of a point) no screen and no printer shows
 _PLACES = re.compile(r' d="[^"]*"| [xy]="[^"]*"|translate\([^)]*\)')
@@ -91,8 +98,9 @@ def comparison_figure(
     log = runs[0].log
     bands = bands or [None] * len(runs)
     states = list(runs[0].fit)
-    # narrow enough that text is legible on a phone
-    figure = new_figure(5.2, 2.1 * len(states) + 0.6)
+    columns = legend_columns(["measured", *(f"{shorten(n)}: fit 100.0 %" for n in names)], _WIDTH)
+    rows = -(-(len(names) + 1) // columns)
+    figure = new_figure(_WIDTH, (2.1 + LEGEND_ROW * (rows - 1)) * len(states) + 0.6)
     grid = figure.add_gridspec(2 * len(states), 1, height_ratios=[1.6, 1] * len(states))
     t = log.t - log.t[0]
     gaps = find_gaps(log.t, log.sample_time)
@@ -144,7 +152,7 @@ def comparison_figure(
             loc="lower left",
             bbox_to_anchor=(0.0, 1.0),
             borderaxespad=0.2,
-            ncols=3,
+            ncols=columns,
             frameon=False,
         )
         for axes in (top, below):
@@ -168,6 +176,16 @@ def percent(fit: float, digits: int = 1) -> str:
 def told_fits(fit: Mapping[str, float], digits: int = 1) -> str:
     """Return the fit of each state in words."""
     return ", ".join(f"{NAMES.get(s, s)} {percent(v, digits)}" for s, v in fit.items())
+
+
+def legend_columns(labels: Sequence[str], width: float, most: int = 3) -> int:
+    """Return the columns of a legend that finds room above the axes of a figure [inch]."""
+    room = 72 * width - _AXIS
+    for columns in range(min(most, len(labels)), 1, -1):
+        longest = [max(map(len, part)) for part in np.array_split(labels, columns)]
+        if sum(_HANDLE + _LETTER * length for length in longest) <= room:
+            return columns
+    return 1
 
 
 def shorten(name: str, most: int = 24) -> str:

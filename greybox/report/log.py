@@ -12,7 +12,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator
 from numpy.typing import NDArray
 
-from greybox.report.figures import BLACK, COLOURS, ORANGE, STYLES, new_figure, tidy
+from greybox.report.figures import (
+    BLACK,
+    COLOURS,
+    LEGEND_ROW,
+    ORANGE,
+    STYLES,
+    legend_columns,
+    new_figure,
+    shorten,
+    tidy,
+)
 from greybox.report.thinning import find_gaps, longest, pick, thin
 from greybox.report.track import draw_track
 from greybox.trial.log import TrialLog
@@ -25,6 +35,7 @@ Array = NDArray[np.float64]
 _MOST_SPANS = 300
 _HOURS_FROM = 3 * 3600.0
 _LONG_NAME = 18
+_LONGEST_LABEL = 40
 # inches: letters stay legible where the page is 390 px wide
 _PHONE = 4.8
 _DOTS = 1500
@@ -77,9 +88,12 @@ def page_figures(log: TrialLog, points: int = 2000) -> dict[str, Figure]:
         draw_track(figures["track"].subplots(), log, clock.gaps, points)
     panels = [*_states(log), *_inputs(log, clock), *_wind(log)]
     if panels:
-        figures["signals"] = new_figure(_PHONE, 1.25 * len(panels) + 0.6)
+        labels = [[shorten(name, _LONGEST_LABEL) for name in panel.lines] for panel in panels]
+        more = sum(-(-len(names) // legend_columns(names, _PHONE)) - 1 for names in labels)
+        height = 1.25 * len(panels) + 0.6 + LEGEND_ROW * more
+        figures["signals"] = new_figure(_PHONE, height)
         axes = figures["signals"].subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-        _draw(list(axes), panels, clock, columns=3, points=points)
+        _draw(list(axes), panels, clock, points)
     return figures
 
 
@@ -188,9 +202,7 @@ def _facts(log: TrialLog, clock: _Clock) -> str:
     return ", ".join(found)
 
 
-def _draw(
-    axes: list[Any], panels: Sequence[_Panel], clock: _Clock, columns: int, points: int
-) -> None:
+def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock, points: int) -> None:
     for ax, panel in zip(axes, panels, strict=True):
         if panel.kind == "direction":
             _draw_direction(ax, panel, clock, min(points, _DOTS))
@@ -223,6 +235,7 @@ def _draw(
             if len(panel.lines) == 1:
                 # the label of the axis names the only line
                 handles, labels = handles[1:], labels[1:]
+            labels = [shorten(label, _LONGEST_LABEL) for label in labels]
             ax.legend(
                 handles,
                 labels,
@@ -230,7 +243,7 @@ def _draw(
                 loc="lower left",
                 bbox_to_anchor=(0.0, 1.0),
                 borderaxespad=0.1,
-                ncols=columns,
+                ncols=legend_columns(labels, _PHONE),
                 frameon=False,
                 handlelength=1.6,
                 columnspacing=1.2,

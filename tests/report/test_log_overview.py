@@ -77,6 +77,20 @@ def test_angles_are_in_degrees_and_wind_from_where_it_comes(ship):
     )
 
 
+def test_long_names_of_many_thrusters_leave_the_curves_their_room():
+    speeds, angles = ([f"{what}_of_thruster_{k}_{'x' * 30}" for k in range(8)]
+                      for what in ("speed", "azimuth"))  # fmt: skip
+    thrusters = [{"type": "azimuth", "x": 1.0 * k, "speed": speeds[k], "angle": angles[k]}
+                 for k in range(8)]  # fmt: skip
+    vessel = vessel_from_dict({"name": "eight", "length": 60.0, "thruster": thrusters})
+    wave = np.sin(np.arange(50.0))
+    figure = signals(make_log(vessel, dict.fromkeys([*speeds, *angles, "u"], wave), 1.0))
+    # what finds no room is warned of
+    assert to_svg(figure, "eight").startswith("<svg")
+    assert all(ax.get_position().width > 0.6 for ax in figure.axes)
+    assert all(ax.get_position().height * figure.get_figheight() > 0.8 for ax in figure.axes)
+
+
 def test_coordinates_of_a_grid_are_written_in_full(ship):
     log = sailed(ship)
     far = {**log.channels, "x_n": log["x_n"] + 6512345, "y_n": log["y_n"] + 598765}

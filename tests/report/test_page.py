@@ -75,6 +75,12 @@ def test_comparison_figure_has_labels_and_units(clean_log, thesis, true_theta):
     figure = comparison_figure(["m"], [run_model(model, clean_log)])
     labels = [a.get_ylabel() for a in figure.axes]
     assert "surge u [m/s]" in labels
+    several = [f"{k}_{'x' * 40}" for k in range(3)]
+    run = run_model(model, clean_log)
+    for names in (["m"], several):
+        figure = comparison_figure(names, [run] * len(names))
+        assert to_svg(figure, "runs").startswith("<svg")
+        assert all(ax.get_position().width > 0.6 for ax in figure.axes)
     assert figure.axes[-1].get_xlabel() == "time from the first sample [s]"
 
 
