@@ -361,10 +361,7 @@ def _outcomes(campaign: Campaign, told: list[Defect], vessel: Vessel) -> list[Ou
     outcomes = []
     if "clock_offset" not in found:
         if apart:
-            positioned = any("x_n" in r for r in campaign.recordings)
-            lacks = "velocity sensor of its own" if positioned else "positions"
-            said = f"heading against yaw rate; no {lacks} to tell which{together}"
-            outcomes.append(Outcome("clock_offset", "clean", said))
+            outcomes.append(_heading_clock_outcome(campaign, together))
         else:
             outcomes.append(_clock_outcome(campaign, information, basis, together))
     if apart:
@@ -391,6 +388,20 @@ def _outcomes(campaign: Campaign, told: list[Defect], vessel: Vessel) -> list[Ou
         )
         outcomes.append(Outcome("heading_bias", "cannot tell" if vague else "clean", said))
     return outcomes
+
+
+def _heading_clock_outcome(campaign: Campaign, together: str) -> Outcome:
+    """Say that heading and yaw rate agree, and what was compared with nothing."""
+    said = f"heading and yaw rate share a clock{together}"
+    logged = {n for r in campaign.recordings for n in r.names}
+    if "x_n" in logged:
+        lacks, alone = "velocity sensor of its own", "the positions"
+    elif logged & {"u", "v"}:
+        lacks, alone = "positions", "the velocities"
+    else:
+        return Outcome("clock_offset", "clean", said)
+    said += f"; no {lacks} to compare {alone} with: whether they do too cannot be told"
+    return Outcome("clock_offset", "cannot tell", said)
 
 
 def _clock_outcome(campaign: Campaign, information: Array, basis: Array, together: str) -> Outcome:
