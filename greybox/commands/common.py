@@ -280,7 +280,8 @@ def _paths(given: Any) -> list[str]:
 
 def configured(options: argparse.Namespace) -> list[str]:
     """Return the options that the configuration file gives; what is removed is not recorded."""
-    return (getattr(options, "configuration", None) or {"options": []})["options"]
+    record: dict[str, list[str]] = getattr(options, "configuration", None) or {}
+    return record.get("options", [])
 
 
 def leave_to_others(options: argparse.Namespace, name: str, default: Any) -> bool:

@@ -122,6 +122,6 @@ def run(options: argparse.Namespace) -> None:
     for note in (*misnamed_columns([options.log], model.vessel), *gaps, *notes, *others):
         say(f"note: {note}")
     if not fill:
-        start = "from the mean of the log's first 5 samples"
-        say(f"free run of {len(result.log)} samples {start}, fit {shown}")
+        began = "from the mean of the log's first 5 samples"
+        say(f"free run of {len(result.log)} samples {began}, fit {shown}")
     say(f"wrote {options.out}")
