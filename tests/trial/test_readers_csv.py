@@ -6,6 +6,7 @@ import contextlib
 import datetime
 import pickle
 import zipfile
+from dataclasses import replace
 from time import process_time
 
 import numpy as np
@@ -22,6 +23,7 @@ from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.parquet import open_parquet
 from greybox.trial.readers.table import read_columns
 from greybox.vessel.toml import vessel_from_dict
+from greybox.vessel.vessel import ColumnMapping
 
 SHIP = {
     "name": "S",
@@ -198,6 +200,24 @@ def test_times_of_day_go_on_past_midnight(tmp_path):
                                 for k in range(86380, 86420))  # fmt: skip
     recording = read_recording(written(tmp_path / "x.csv", text), VESSEL)
     np.testing.assert_allclose(np.diff(recording["u"].t), 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "read"),
+    [("2026-06-02 09:30:{:02}", "dates"), ("09:30:{:02}", "times of day")],
+)
+def test_dates_are_not_said_to_be_seconds(tmp_path, text, read):
+    table = frame().head(50)
+    times = [text.format(k) for k in range(len(table))]
+    named = {n: table.drop(columns="t").assign(**{n: times}) for n in ("Time_UTC", "Datum")}
+    for name, made in named.items():
+        made.to_csv(tmp_path / f"{name}.csv", index=False)
+    recording = read_recording(tmp_path / "Time_UTC.csv", VESSEL)
+    assert f"column 'Time_UTC' taken for time by its {read}" in recording.notes
+    with pytest.raises(LogError, match=r'\[columns\], such as "Datum" = "t" \(dates and'):
+        read_recording(tmp_path / "Datum.csv", VESSEL)
+    mapped = replace(VESSEL, columns={"Datum": ColumnMapping("t", None)})
+    np.testing.assert_allclose(np.diff(read_recording(tmp_path / "Datum.csv", mapped)["u"].t), 1)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("s", 1), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])

@@ -232,10 +232,13 @@ def table_columns(
         advice = "Map" if guess else f"Make a log of it with {making}, or map"
         timed = (c for c in table.columns if c in table.dates | table.clocks or "time" in c.lower())
         likely = next(timed, "tvec")
+        read = likely in table.dates | table.clocks
+        entry = f'"{likely}" = ' + ('"t"' if read else '{ name = "t", unit = "s" }')
         raise LogError(
             f"'{table.path.name}' has no column 't'.{suggestion('t', table.columns)} "
-            f'{advice} the time column in the vessel file\'s [columns], such as "{likely}" = '
-            f'{{ name = "t", unit = "s" }}. Its columns: {", ".join(table.columns[:30])}.'
+            f"{advice} the time column in the vessel file's [columns], such as {entry}"
+            f"{' (dates and times of day are read as such)' if read else ''}. "
+            f"Its columns: {', '.join(table.columns[:30])}."
         )
     time = assigned["t"].raw
     if time in table.text:

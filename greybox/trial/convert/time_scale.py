@@ -64,7 +64,7 @@ def time_scale(raw: Array, time: Assigned, table: TableFile) -> TimeScale:
         )
     head = finite[:_HEAD]
     size = float(np.median(np.abs(head)))
-    date, unit = time.raw in table.dates, time.unit
+    date, clock, unit = time.raw in table.dates, time.raw in table.clocks, time.unit
     notes: list[str] = []
     # the name 't' alone promises seconds, which numbers of that size cannot be
     stated = unit is not None and not (unit == "s" and time.how == "exact" and unix_unit(size))
@@ -73,8 +73,9 @@ def time_scale(raw: Array, time: Assigned, table: TableFile) -> TimeScale:
     if time.raw == STAMP:
         notes.append("times are the header stamps")
     elif time.how == "guessed" or not stated:
-        notes.append(f"column '{time.raw}' taken for time in {unit or 's'}")
-    if date or time.raw in table.clocks:
+        how = "by its dates" if date else "by its times of day" if clock else f"in {unit or 's'}"
+        notes.append(f"column '{time.raw}' taken for time {how}")
+    if date or clock:
         unit = "s"
     factor = unit_factor(unit or "s", "s", time.raw)
     first = float(finite[0])
