@@ -43,6 +43,7 @@ from experiment_design.optimise.lead_in import after_lead_in
 from experiment_design.optimise.search import Candidate, assess, limit_scale, to_unit, within_reach
 from experiment_design.optimise.solve import EXACT_COLUMNS, Outcome, solve_ipopt
 from experiment_design.output.result import Design, PlanPart, logdet_information, run_through
+from experiment_design.output.sheet_contents import turned_notes
 from experiment_design.request.apparent_wind import air_notes
 from experiment_design.request.problem import TrialProblem
 from experiment_design.request.request import (
@@ -180,12 +181,6 @@ def design_trial(
             evaluations += more
         except KeyboardInterrupt:
             stopped = True
-        if keeping is not None and keeping.probability < request.probability:
-            notes.append(
-                f"the limits are kept with probability {keeping.probability:.2f}, "
-                f"{request.probability:g} was asked for: lower the margins, or trust the prior "
-                f"model less by a first short trial."
-            )
     units = [c.unit for c in candidates]
     covariance = covariance_of(problems, units)
     if not np.isfinite(covariance).all() and not request.contrasts:
@@ -276,7 +271,7 @@ def described(
         motions = (_behind(request, run_through(request, levels[0])),)
     reports = _limit_reports(request, problems, motions, levels)
     late = late_notes(request, problems, motions, reports, covariance)
-    return Design(
+    design = Design(
         request,
         commands,
         levels,
@@ -294,12 +289,19 @@ def described(
         keeping,
         (),
         status,
-        (*led, *notes, *late, *air_notes(request, motions)),
+        (*led, *notes, *late, *air_notes(request, motions), *turned_notes(request.vessel)),
         evaluations,
         time.perf_counter() - began,
         parts,
         random_std,
     )
+    if keeping is None or not design.doubtful:
+        return design
+    doubt = (
+        f"the limits are kept with probability {keeping.probability:.2f}, {request.probability:g} "
+        f"was asked for: do not sail this plan as it is, but {design.remedy}"
+    )
+    return replace(design, notes=(doubt, *design.notes))
 
 
 def _parts(lead: LeadIn, request: PreparedRequest) -> tuple[PlanPart, ...]:

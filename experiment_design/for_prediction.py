@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -44,8 +44,9 @@ Array = NDArray[np.float64]
 
 # rounds of tightening limits until they are kept with the wanted probability
 _TIGHTENINGS = 3
-# misfit of a prior that nothing was held out for, as a share of the spread of each state
-_UNKNOWN_MISFIT = 0.3
+# misfit of a prior that nothing was held out for, as a share of the spread of each state, and how
+# one is called that only its diagnosis held something out for
+_UNKNOWN_MISFIT, _DIAGNOSED = 0.3, "diagnosed"
 # deviations of its sensor within which the sign of sway is not known (A10)
 _CLOSE = 3.0
 # of the range of a speed in the prior's trial: what the plan may go beyond; slowest speed
@@ -72,7 +73,10 @@ class PredictionDesign:
         When the sign of sway is not known by its sensor, beginning and end [s], of the first
         trial.
     level : str
-        Verdict on the prior's predictions, empty where it has none.
+        Verdict on the prior's predictions, ``diagnosed`` where only its diagnosis held a log out,
+        empty where nothing was.
+    missed : dict of str to float
+        Share of each state's spread by which a diagnosed prior missed what was held out.
     """
 
     design: Design
@@ -82,6 +86,7 @@ class PredictionDesign:
     commands: dict[str, tuple[float, float]]
     crossings: tuple[tuple[float, float], ...]
     level: str
+    missed: Mapping[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON: those of the design, and what is expected of predictions."""
@@ -113,7 +118,12 @@ class PredictionDesign:
             f"{error} (rms, m/s and rad/s, where the estimate chooses its terms by this trial)"
         )
         if np.isfinite(self.random):
-            said += f"; after random steps of the same length by {self.random:.2f} times as much"
+            often = f"{self.random:.2f} times as much"
+            said += (
+                f"; of what a trial can tell, random steps of the same length leave {often}"
+                if self.missed
+                else f"; after random steps of the same length by {often}"
+            )
         if self.design.request.untried:
             said += (
                 ". No estimated model stands behind these numbers, only the ship's main "
@@ -124,6 +134,19 @@ class PredictionDesign:
             said += (
                 f". The prior's own predictions are {self.level}: take these numbers as a guess, "
                 f"and design again after the first part of the trial"
+            )
+        elif self.missed:
+            shares = ", ".join(f"{n} {share:.0%}" for n, share in self.missed.items())
+            said += (
+                f". They hold for a ship that the prior's structure fits. The prior has no verdict "
+                f"on its predictions: what its free runs missed of logs that its diagnosis held "
+                f"out ({shares} of the spread) is taken to stay after the trial"
+            )
+        elif not self.level:
+            said += (
+                f". They hold for a ship that the prior's structure fits. The prior has no verdict "
+                f"on its predictions: it is assumed to miss {_UNKNOWN_MISFIT:.0%} of each spread, "
+                f"most of which the trial tells, so take these numbers as a guess"
             )
         return f"{said}."
 
@@ -198,11 +221,17 @@ def command_ranges(
 
 
 def prior_misfit(model: ManoeuvringModel) -> tuple[Array, str]:
-    """Return the error of a prior's free runs as a share of each spread (nx,), and its verdict."""
+    """Return the error of a prior's free runs as a share of each spread (nx,), and its verdict.
+
+    A plan allows for no less misfit of a prior that was only diagnosed than of one for which
+    nothing was held out: the current of the log held out was estimated on it.
+    """
     verdict = model.record.get("verdict")
     prediction = verdict.get("prediction") if isinstance(verdict, Mapping) else None
     if not isinstance(prediction, Mapping):
-        return np.full(len(model.structure.states), _UNKNOWN_MISFIT), ""
+        missed = diagnosed_misfit(model)
+        shares = [missed.get(s, 0.0) for s in model.structure.states]
+        return np.maximum(shares, _UNKNOWN_MISFIT), _DIAGNOSED if missed else ""
     fit = prediction.get("fit")
     fit = fit if isinstance(fit, Mapping) else {}
     shares = [
@@ -211,6 +240,19 @@ def prior_misfit(model: ManoeuvringModel) -> tuple[Array, str]:
         for s in model.structure.states
     ]  # fmt: skip
     return np.array(shares), str(prediction.get("level", ""))
+
+
+def diagnosed_misfit(model: ManoeuvringModel) -> dict[str, float]:
+    """Return which share of each spread free runs missed of what a model's diagnosis held out.
+
+    Empty where the model is of no diagnosis.
+    """
+    diagnosis, remainder = (model.record.get(n) for n in ("diagnosis", "remainder"))
+    told = remainder if isinstance(remainder, Mapping) and remainder.get("added") else diagnosis
+    gain = told.get("gain") if isinstance(told, Mapping) else None
+    fits = {s: g["after"] for s, g in gain.items()} if isinstance(gain, Mapping) else {}
+    known = {s: f for s, f in fits.items() if isinstance(f, int | float) and np.isfinite(f)}
+    return {s: min(1.0, max(0.0, 1 - f / 100)) for s, f in known.items()}
 
 
 def operating_envelope(
@@ -305,6 +347,9 @@ def design_for_prediction(
     design = replace(design, parts=_parts(asked, design.parts, usual))
     known = before + log_moments(found, design.motions[1:])
     noise, unknown = found.errors(design.motions[0], known)
+    missed = diagnosed_misfit(model) if level == _DIAGNOSED else {}
+    # no cause that a diagnosis knows, and no coefficient, explained it
+    unknown = np.maximum(unknown, [missed.get(s, 0.0) ** 2 for s in states])
     kept = searches[0].random[np.isfinite(searches[0].random)]
     random = float(np.median(np.exp(-kept))) if len(kept) else float("nan")
     v = states.index("v") if "v" in states else None
@@ -322,6 +367,7 @@ def design_for_prediction(
          zip(asked.schedule.commands, found.lower, found.upper, strict=True)},
         crossings,
         level,
+        missed,
     )  # fmt: skip
 
 

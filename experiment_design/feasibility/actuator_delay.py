@@ -66,7 +66,7 @@ def late_notes(
         ratio = np.sqrt(np.diag(with_it) / np.diag(covariance))
         if np.abs(ratio - 1).max() > _SLIGHT:
             said.append(
-                f"with it the standard errors are {ratio.min():.2f} to {ratio.max():.2f} times "
-                f"those shown"
+                f"with it the standard errors of coefficients are {ratio.min():.2f} to "
+                f"{ratio.max():.2f} times those predicted without it"
             )
     return said

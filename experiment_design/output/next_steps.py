@@ -8,8 +8,8 @@ from typing import Any
 from greybox.report.next_steps import NextStep, typed
 
 
-def after_design(record: Mapping[str, Any], judged: bool) -> list[NextStep]:
-    """Return what to do once the plan has been sailed.
+def after_design(record: Mapping[str, Any], judged: bool, remedy: str = "") -> list[NextStep]:
+    """Return what to do once the plan has been sailed, or before one that breaks its limits is.
 
     Parameters
     ----------
@@ -17,7 +17,11 @@ def after_design(record: Mapping[str, Any], judged: bool) -> list[NextStep]:
         As the command records it.
     judged : bool
         Whether the plan has a part to judge the estimate by.
+    remedy : str
+        What helps a plan that does not keep its limits as it was asked to.
     """
+    if remedy:
+        return [NextStep(f"Do not sail this plan as it is: {remedy}")]
     vessel, given = typed(record, "vessel", "V"), record.get("command", {})
     check = NextStep(
         "Sail the plan, and check its log before you leave the area",

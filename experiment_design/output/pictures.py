@@ -16,7 +16,7 @@ from experiment_design.constraints.kinds.sea_room import edge_distance
 from experiment_design.constraints.limits import Circle
 from experiment_design.output.prediction import MotionBand
 from experiment_design.output.result import Design
-from experiment_design.output.sheet_contents import clock
+from experiment_design.output.sheet_contents import clock, shown_as
 from greybox.report.figures import BLACK, BLUE, COLOURS, GREEN, VERMILION, tidy
 
 Array = NDArray[np.float64]
@@ -235,15 +235,16 @@ def draw_commands(axes: Any, design: Design, trial: int, size: float = 7.0) -> N
     schedule, commands = r.schedule, design.commands[trial]
     t = np.arange(len(commands) + 1) * r.sample_time
     for i, (ax, name) in enumerate(zip(axes, schedule.commands, strict=True)):
-        value = np.append(commands[:, i], commands[-1, i])
-        low, high = float(schedule.lower[i]), float(schedule.upper[i])
+        shown, sign = shown_as(r.vessel, name)
+        value = sign * np.append(commands[:, i], commands[-1, i])
+        low, high = sorted(sign * np.array([schedule.lower[i], schedule.upper[i]]))
         for bound in (low, high):
             ax.axhline(bound, color="0.45", linestyle=":", linewidth=0.8)
         ax.plot(t, value, color=COLOURS[i % 6], linewidth=1.2, drawstyle="steps-post")
         room = 0.12 * ((high - low) or abs(high) or 1.0)
         ax.set_ylim(low - room, high + room)
         ax.yaxis.set_major_locator(MaxNLocator(3))
-        shown = name if len(name) <= 14 else name[:13] + "…"
+        shown = shown if len(shown) <= 14 else shown[:13] + "…"
         angle = name in r.vessel.angle_commands
         unit = "rad" if angle else "as log"
         ax.set_ylabel(f"{shown}\n[{unit}]", fontsize=size, parse_math=False)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment_design.certificate.certificate import Certificate
-from experiment_design.constraints.limits import LimitReport
+from experiment_design.constraints.limits import TOLERANCE, LimitReport
 from experiment_design.criteria.optimality import CRITERIA
 from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
@@ -139,6 +139,29 @@ class Design(DisplayMixin):
     def lead_in_s(self) -> float:
         """Length of the lead-in [s], 0 without one."""
         return sum(p.seconds for p in self.parts if p.name == LEAD_IN)
+
+    @property
+    def broken(self) -> tuple[LimitReport, ...]:
+        """Limits that the nominal motion misses by more than rounding."""
+        return tuple(x for x in self.limits if x.missed > 10 * TOLERANCE)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the limits are kept with a lower probability than was asked for."""
+        return self.keeping is not None and self.keeping.probability < self.request.probability
+
+    @property
+    def remedy(self) -> str:
+        """What helps a plan that breaks its limits, or may; empty where it keeps them."""
+        if not (self.broken or self.doubtful):
+            return ""
+        r = self.request
+        wider = "give it more room (--area, --circle), " if r.limits.area is not None else ""
+        less = "narrow --envelope" if r.misfit is not None else "lower the margins"
+        return (
+            f"{wider}shorten it (--duration), {less}, or sail a short trial first and design again "
+            f"with the model that it gives"
+        )
 
     def share(self, part: PlanPart) -> float:
         """Return what a part takes of its trial's time, lead-in included."""

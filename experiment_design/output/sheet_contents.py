@@ -9,12 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.constraints.limits import TOLERANCE
 from experiment_design.output.legs import Leg, planned_ends
 from experiment_design.output.prediction import MotionBand
 from experiment_design.output.result import Design
 from experiment_design.request.regimes import spell_regime
+from greybox.errors import UsageError
+from greybox.prediction.helm import find_helm
 from greybox.trial.plan_parts import VALIDATION
+from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 Samples = NDArray[np.intp]
@@ -157,6 +159,8 @@ def sheet_contents(
     if not band.certain:
         by = " by the clock" if legs is not None else ""
         note += f" ±: 95 % of the motions predicted{by} have stayed within since the start."
+    signs = signs_words(r.vessel)
+    note = f"{signs[:1].upper()}{signs[1:]} {note}".lstrip()
     return SheetContents(
         f"{plain_name(r.vessel.name)}: identification {which}"
         + (", planned without an estimated model" if r.untried else ""),
@@ -206,21 +210,85 @@ def _command_words(commands: Mapping[str, float], design: Design) -> str:
     rudders = [t.rudder for t in r.vessel.thrusters if t.rudder is not None]
     said = []
     for i, (name, value) in enumerate(commands.items()):
+        shown, sign = shown_as(r.vessel, name)
         if name not in r.vessel.angle_commands:
             span = float(r.schedule.upper[i] - r.schedule.lower[i])
-            said.append(f"{name} {_speed_cells(np.array([value]), span)[0]}")
+            said.append(f"{shown} {_speed_cells(np.array([sign * value]), span)[0]}")
             continue
         what = name
         if name in rudders:
             what = "rudder" if len(set(rudders)) == 1 else f"rudder {name}"
-        angle = degrees(value)
-        said.append(f"{what} {side(value)} {angle}" if angle != "0°" else f"{what} midships")
+        angle, turns = degrees(value), steers(r.vessel, name)
+        if angle == "0°":
+            said.append(f"{what} midships")
+            continue
+        if name in rudders:
+            words = f"{what} {side(value)} {angle}"
+        elif turns:
+            words = f"{what} {angle} to turn her to {side(turns * value)}"
+        else:
+            words = f"{what} pushing {angle} to {side(value)}"
+        if sign < 0:
+            words += f" ({shown} {signed(float(np.rad2deg(sign * value)), 1)}°)"
+        said.append(words)
     return ", ".join(sorted(said, key=lambda text: not text.startswith("rudder")))
+
+
+def shown_as(vessel: Vessel, name: str) -> tuple[str, int]:
+    """Return the name and sign under which a log of the vessel shows a command.
+
+    They differ from the vessel file's where every raw column that it reads as the command has the
+    sign turned.
+    """
+    raw = {column: c.sign for column, c in vessel.columns.items() if c.name == name}
+    turned = name in vessel.sensors.get("reversed", ())
+    signs = {sign * (-1 if turned else 1) for sign in (raw.values() or (1,))}
+    return (next(iter(raw), f"{name} (as logged)"), -1) if signs == {-1} else (name, 1)
+
+
+def steers(vessel: Vessel, name: str) -> int:
+    """Return 1 where a positive angle turns the ship to starboard, −1 to port, 0 for neither.
+
+    A rudder's does; an azimuth's where nothing else steers, because its angle is the direction in
+    which it pushes, and several that push one way may turn her either way.
+    """
+    if any(t.rudder == name for t in vessel.thrusters):
+        return 1
+    if len(vessel.angle_commands) > 1:
+        return 0
+    try:
+        helm = find_helm(vessel, (name,), limited=False)
+    except UsageError:
+        return 0
+    return int(np.sign(helm.steer[helm.columns.index(name)]))
 
 
 def side(value: float) -> str:
     """Return the side of an angle or rate of turn."""
     return "starboard" if value > 0 else "port"
+
+
+def signs_words(vessel: Vessel) -> str:
+    """Return what a positive angle does, of each angle as its log shows it."""
+    said = []
+    for name in sorted(vessel.angle_commands):
+        shown, sign = shown_as(vessel, name)
+        turns = steers(vessel, name)
+        what = f"turns her to {side(sign * turns)}" if turns else f"pushes to {side(sign)}"
+        said.append(f"positive {shown} {what}")
+    return f"{'; '.join(said)}." if said else ""
+
+
+def turned_notes(vessel: Vessel) -> list[str]:
+    """Return which commands of a plan a log of the vessel shows with the other sign."""
+    shown = {name: shown_as(vessel, name) for name in vessel.commands}
+    return [
+        f"the plan and its legs hold {name} as the vessel file defines it, which the log's {raw} "
+        f"shows with the other sign: an autopilot that is ordered by {raw} needs it turned, and "
+        f"the sheet and words have it so"
+        for name, (raw, sign) in shown.items()
+        if sign < 0
+    ]
 
 
 def degrees(value: float) -> str:
@@ -295,13 +363,13 @@ def _warnings(design: Design, band: MotionBand) -> tuple[str, ...]:
     found = []
     broken = [
         x.name + (f" by {x.missed:.3g} {x.unit}".rstrip() if np.isfinite(x.missed) else "")
-        for x in design.limits
-        if x.trial == band.trial and x.missed > 10 * TOLERANCE
+        for x in design.broken
+        if x.trial == band.trial
     ]
     if broken:
         found.append(f"This plan breaks its limits: {', '.join(broken)}.")
     keeping = design.keeping
-    if keeping is not None and keeping.probability < design.request.probability:
+    if keeping is not None and design.doubtful:
         found.append(
             f"Limits are kept with probability {keeping.probability:.2f} only; "
             f"{design.request.probability:g} was asked for."
@@ -417,10 +485,11 @@ def _columns(
     r = design.request
     schedule = r.schedule
     levels = design.levels[band.trial]
+    shown = [shown_as(r.vessel, name) for name in schedule.commands]
     made = [
         _command_cells(
-            name,
-            levels[:, i],
+            shown[i][0],
+            shown[i][1] * levels[:, i],
             float(schedule.upper[i] - schedule.lower[i]),
             name in r.vessel.angle_commands,
             radians,

@@ -19,7 +19,13 @@ from experiment_design.output.legs import LegPlan
 from experiment_design.output.pictures import draw_commands, draw_plan_track
 from experiment_design.output.prediction import MotionBand, predict_motion
 from experiment_design.output.result import Design
-from experiment_design.output.sheet_contents import Column, SheetContents, sheet_contents, tie
+from experiment_design.output.sheet_contents import (
+    Column,
+    SheetContents,
+    sheet_contents,
+    shown_as,
+    tie,
+)
 from greybox.errors import UsageError
 from greybox.files import replacing, write_text
 from greybox.report.figures import new_figure, to_svg
@@ -216,6 +222,7 @@ def _trial(design: Design, band: MotionBand, legs: LegPlan | None) -> dict[str, 
     commands = new_figure(_INNER_WIDTH / 25.4, (count * layout.panel + 8) / 25.4)
     draw_commands(commands.subplots(count, 1, squeeze=False)[:, 0], design, band.trial, 6.8)
     north, east = band["x_n"].nominal, band["y_n"].nominal
+    names = [shown_as(design.request.vessel, c)[0] for c in schedule.commands]
     return {
         "contents": contents,
         "layout": layout,
@@ -227,9 +234,7 @@ def _trial(design: Design, band: MotionBand, legs: LegPlan | None) -> dict[str, 
             f"Map, north up: the expected track covers {np.ptp(north):.0f} m from south to north "
             f"and {np.ptp(east):.0f} m from west to east; its way-points are in the table below."
         ),
-        "commands_words": (
-            f"Steps of {', '.join(schedule.commands)} against time, as in the table below."
-        ),
+        "commands_words": (f"Steps of {', '.join(names)} against time, as in the table below."),
     }
 
 

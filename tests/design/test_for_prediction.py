@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 from designs import limited_ship, make_request, ship_file, thesis_model
 
+from experiment_design import for_prediction
 from experiment_design.constraints.limits import TrialLimits
 from experiment_design.excitation.rollout import Rollout
+from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
 from experiment_design.for_prediction import (
     command_ranges,
     design_for_prediction,
+    diagnosed_misfit,
     prior_misfit,
 )
 from experiment_design.information.envelope import _sensitivities, build_envelope
@@ -23,6 +26,7 @@ from experiment_design.optimise.envelope_search import (
     usual_beginnings,
     usual_manoeuvres,
 )
+from experiment_design.output.next_steps import after_design
 from experiment_design.request.request import build_problem
 from greybox.commands.main import main
 from greybox.errors import InfeasibleError, UsageError
@@ -298,6 +302,54 @@ def test_the_misfit_of_a_prior_is_what_its_verdict_says(model) -> None:
     share, level = prior_misfit(replace(model, record={}))
     assert (share == 0.3).all()
     assert level == ""
+
+
+def gained(**after):
+    return {"gain": {s: {"before": 0.0, "after": fit, "ci": [0, 1]} for s, fit in after.items()}}
+
+
+def test_a_diagnosed_prior_errs_by_what_its_held_out_runs_missed(found, model, monkeypatch) -> None:
+    diagnosis = gained(u=90.0, v=20.0, r=None)
+    of_diagnosis = replace(model, record={"diagnosis": diagnosis})
+    assert diagnosed_misfit(of_diagnosis) == pytest.approx({"u": 0.1, "v": 0.8})
+    share, level = prior_misfit(of_diagnosis)
+    # a plan allows for no less than for a prior that nothing is known of
+    assert share == pytest.approx([0.3, 0.8, 0.3])
+    assert level == "diagnosed"
+    record = {"diagnosis": diagnosis, "remainder": gained(u=95.0) | {"added": True}}
+    assert diagnosed_misfit(replace(model, record=record)) == pytest.approx({"u": 0.05})
+    record["remainder"]["added"] = False
+    assert diagnosed_misfit(replace(model, record=record)) == diagnosed_misfit(of_diagnosis)
+
+    request = request_of(duration=200.0, effort=0.01, covariance=model.covariance)
+    searched = []
+    campaign = for_prediction._campaign
+
+    def known(request, envelope, *more):
+        searched.append(envelope)
+        return campaign(request, envelope, *more)
+
+    keeping = ConstraintSatisfaction(0.15, 0.12, 0.19, 400, np.zeros(1), {}, misled=True)
+    monkeypatch.setattr(for_prediction, "_campaign", known)
+    monkeypatch.setattr(
+        for_prediction, "tighten", lambda request, searches, *_: (request, searches, keeping)
+    )
+    plan = design_for_prediction(request, of_diagnosis)
+    assert plan.misfit["u"] >= 0.1 * searched[0].spread[0]
+    assert plan.misfit["v"] >= 0.8 * searched[0].spread[1]
+    said = plan.headline()
+    assert "(u 10%, v 80% of the spread) is taken to stay" in said
+    assert "has no verdict" in said
+    assert "has no verdict" not in found.headline()
+    assert "assumed to miss 30%" in replace(plan, level="", missed={}).headline()
+    # a plan that breaks its limits is told as one, by its notes and by what comes next
+    note = plan.design.notes[0]
+    assert note.startswith("the limits are kept with probability 0.15, 0.9 was asked for: do not")
+    assert "narrow --envelope" in note
+    assert note in plan.summary()
+    (step,) = after_design({}, True, plan.design.remedy)
+    assert step.line().startswith("next: do not sail this plan as it is: shorten it (--duration)")
+    assert found.design.remedy == ""
 
 
 def test_an_envelope_ends_at_the_limits_of_the_commands() -> None:

@@ -43,7 +43,7 @@ def test_the_reported_motion_is_that_of_the_simulator():
     said = [x for x in design.notes if "the search leaves out a lag of 3 s of the propeller" in x]
     assert said
     assert "a delay of 1.5 s" in said[0]
-    assert any("with it the standard errors are" in x for x in design.notes)
+    assert any("with it the standard errors of coefficients are" in x for x in design.notes)
 
 
 def test_a_limit_that_the_late_motion_misses_is_named():

@@ -20,7 +20,13 @@ from experiment_design.output.legs import Leg, drawn_models, legs_of, planned_en
 from experiment_design.output.legs_file import csv_path, legs_path, legs_to_dict, write_legs
 from experiment_design.output.prediction import predict_motion
 from experiment_design.output.result import Design
-from experiment_design.output.sheet_contents import leg_words, sheet_contents
+from experiment_design.output.sheet_contents import (
+    leg_words,
+    sheet_contents,
+    shown_as,
+    signs_words,
+    turned_notes,
+)
 from experiment_design.output.trial_sheet import write_sheet
 from experiment_design.prepare import both_sides, prepare_request
 from experiment_design.request.request import DesignRequest
@@ -28,6 +34,7 @@ from greybox.commands.main import main
 from greybox.errors import UsageError
 from greybox.model.semi_empirical import semi_empirical_model
 from greybox.vessel.toml import load_vessel
+from greybox.vessel.vessel import ColumnMapping
 
 # main dimensions of the tanker of the foreign ships, as a crew knows them
 DIMENSIONS = "beam = 1.27\nmass = 3270.0\nservice_speed = 1.18\n"
@@ -250,6 +257,45 @@ def test_a_foreign_ship_keeps_the_plan_better_by_legs(tanker, tmp_path) -> None:
 )
 def test_words(tanker, changes, words) -> None:
     assert leg_words(simple_legs(**changes), tanker[0], 0).endswith(words)
+
+
+def test_words_and_sheet_of_a_steered_jet_name_the_side_to_which_the_ship_turns() -> None:
+    """Its log shows the other sign: what a crew reads there turns the ship as the plan does."""
+    ship = limited_ship(angles=(-0.6, 0.6))
+    jet = replace(ship, thrusters=ship.thrusters[1:])
+    columns = {"Helm_deg": ColumnMapping("alpha2", "deg", -1)}
+    for angle, turns in ((0.3, "port"), (-0.3, "starboard")):
+        request = make_request(
+            vessel=jet,
+            starts=(np.array([1.5, 0.0, 0.0, 0.0]),),
+            duration=20.0,
+            limits=TrialLimits(),
+        )
+        design = design_of(request, np.array([(15.0, angle), (15.0, angle)]))
+        turned = design.motions[0].state[0, -1, 2]
+        assert (turned > 0) == (turns == "starboard")
+        leg = simple_legs(commands={"n": 15.0, "alpha2": angle})
+        words = leg_words(leg, design, 0)
+        assert words == f"N 15.0, alpha2 17.2° to turn her to {turns}; for 20 s"
+        assert turned_notes(jet) == []
+        mapped = replace(request, vessel=replace(jet, columns=columns))
+        design = replace(design, request=mapped)
+        read = "−17.2" if angle > 0 else "17.2"
+        assert f"turn her to {turns} (Helm_deg {read}°); for" in leg_words(leg, design, 0)
+        (band,) = predict_motion(design, draws=1)
+        contents = sheet_contents(design, band)
+        (shown,) = [c for c in contents.columns if c.name == "Helm_deg"]
+        assert shown.cells[0].startswith(read)
+        assert contents.note.startswith("Positive Helm_deg turns her to starboard. ")
+        assert "alpha2 as the vessel file defines it" in turned_notes(mapped.vessel)[0]
+    # the vessel file may take the sign out by [sensors] as well, and both leave what it was
+    both = replace(mapped.vessel, sensors={"reversed": ("alpha2",)})
+    assert shown_as(both, "alpha2") == ("alpha2", 1)
+    assert shown_as(replace(both, columns={}), "alpha2") == ("alpha2 (as logged)", -1)
+    # several azimuths turn her together: each pushes to its side
+    assert signs_words(ship) == (
+        "positive alpha1 pushes to starboard; positive alpha2 pushes to starboard."
+    )
 
 
 def test_files(tanker, tmp_path) -> None:

@@ -208,8 +208,8 @@ def test_a_steady_start_is_told_with_its_commands(known):
     held = np.array([15.0, np.deg2rad(40.0), np.deg2rad(50.0)])
     steady = replace(known, request=replace(known.request, start_commands=(held,)))
     start = dict(sheet_contents(steady, band).facts)["Start"]
-    set_up = "to set it up, hold n 15.0, alpha1 starboard 40°, alpha2 starboard 50° until she is"
-    assert start.endswith(f"{set_up} steady")
+    set_up = "hold n 15.0, alpha1 pushing 40° to starboard, alpha2 pushing 50° to starboard"
+    assert start.endswith(f"to set it up, {set_up} until she is steady")
     (told,) = steady.to_dict()["start_commands"]
     assert told == dict(zip(known.request.schedule.commands, held, strict=True))
     assert "hold" not in dict(sheet_contents(known, band).facts)["Start"]
