@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.quantities import numbers_by_true_north
-from greybox.diagnosis.ship import CURRENTS, Sensors, Ship, Wire
+from greybox.diagnosis.ship import CURRENTS, Sensors, Ship, Wire, derived_motions
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.run.changes import Change
@@ -132,8 +132,7 @@ def extended_vessel(
         said["velocities_from_heading"] = True
     if any(sensors.lever):
         # velocities that follow from positions are those of the antenna
-        derived = any(s.derives_motion and "u" in s.channels for s in log.provenance.steps)
-        key = "antenna" if derived else "velocity_at"
+        key = "antenna" if "u" in derived_motions(log) else "velocity_at"
         before = tuple(said.get(key, (0.0, 0.0)))
         said[key] = (before[0] + sensors.lever[0], before[1] + sensors.lever[1], *before[2:])
     if sensors.late:

@@ -97,6 +97,8 @@ class Hypothesis:
     place : str
         What of the vessel it is of alone, such as the column of one command, where no name of its
         parameters tells it.
+    unit : str
+        Of the number in its sentence, where that tells one: held at its values it has no parameters.
     only : bool
         Whether a ship has room for one hypothesis of this cause.
     past : bool
@@ -116,6 +118,7 @@ class Hypothesis:
     parity: int = 0
     refit_from_scratch: bool = False
     place: str = ""
+    unit: str = ""
     only: bool = False
     past: bool = False
 

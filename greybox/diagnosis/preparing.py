@@ -13,7 +13,7 @@ from greybox.diagnosis.evidence.kinematics import decided, denied, judged_by_kin
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.null_model import Clock, DiagnosisProblem, clocks_of
 from greybox.diagnosis.point import Fit
-from greybox.diagnosis.ship import CURRENTS, Change
+from greybox.diagnosis.ship import CURRENTS, Change, derived_motions
 from greybox.errors import LogError, UsageError, suggestion
 from greybox.estimation.informative import require_commands, require_motion
 from greybox.model.catalogue import for_inputs, get_structure, structure_for
@@ -272,6 +272,7 @@ def _context(
             c: max(float(np.abs(np.diff(x)).max()) for x in v) / first.sample_time
             for c, v in moved.items()
         },
+        derived=frozenset[str]().union(*map(derived_motions, logs)),
     )
 
 

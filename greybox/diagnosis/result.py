@@ -41,6 +41,8 @@ _SAID = {
 
 # share of the squared error from which on a part is worth a line of text
 _SHOWN = 0.005
+# a 95 % interval of a share that is wider excludes none, from minus to plus the whole error
+_ANY = 2.0
 
 
 def finite(value: float) -> float | None:
@@ -490,7 +492,7 @@ def _budget_lines(budget: Sequence[BudgetPart]) -> list[str]:
         return []
     states = list(budget[0].share)
     shown = [p for p in budget if any(abs(v) >= _SHOWN for v in (*p.share.values(),))]
-    cells = [["", *states], *([p.part, *(_share(p, s) for s in states)] for p in shown)]
+    cells = [["", *states], *([p.part, *(told_share(p, s) for s in states)] for p in shown)]
     first, *wide = (max(map(len, column)) + 2 for column in zip(*cells, strict=True))
     lines = [
         f"  {part:<{first}}" + "".join(f"{v:>{w}}" for v, w in zip(row, wide, strict=True))
@@ -516,8 +518,11 @@ def hardly_split(budget: Sequence[BudgetPart]) -> str:
     )
 
 
-def _share(part: BudgetPart, state: str) -> str:
+def told_share(part: BudgetPart, state: str) -> str:
+    """Return a share with its interval in percent, or that the logs do not tell it."""
     low, high = part.ci[state]
+    if high - low > _ANY:
+        return "cannot be split"
     return f"{100 * part.share[state]:.1f} ({100 * low:.1f} to {100 * high:.1f})"
 
 

@@ -18,7 +18,7 @@ from greybox.diagnosis.linear import Linear, sensitivities
 from greybox.diagnosis.simulator import VaryingSimulator
 from greybox.model.run.step import Integrator, Rule, StepModel, held, integrated
 from greybox.model.structure import Structure
-from greybox.rotation import ned_to_body
+from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.log import TrialLog
 from greybox.vessel.actuation import actuated_force, delayed
 from greybox.vessel.vessel import Vessel
@@ -121,6 +121,11 @@ class Shown:
     start: Array
 
 
+def derived_motions(log: TrialLog) -> frozenset[str]:
+    """Return the velocities and yaw rate of a log that were made of other channels."""
+    return frozenset(n for s in log.provenance.steps if s.derives_motion for n in s.channels)
+
+
 class LogRun:
     """One log ready to be run under hypotheses.
 
@@ -157,6 +162,9 @@ class LogRun:
         self._gaps = [i for i, measured in enumerate(self.known.T) if not measured.all()]
         self.y = self._across_gaps(np.column_stack([log[n] for n in self.outputs]))
         self.heading = log["psi"] if "psi" in log else np.zeros(len(log))
+        # u and v were turned out of earth axes by the heading of their sample
+        made = {"u", "v"} <= derived_motions(log) and {"u", "v"} <= set(self.states)
+        self._over_ground = made and "psi" in log
         self._psi = held(self.heading, integrator)
         air = log.air
         self.air_measured = air is not None and structure.uses_air
@@ -305,9 +313,18 @@ class LogRun:
                 y[:, iv] = y[:, iv] + sensors.lever[0] * rate
             if sensors.turned:
                 y[:, iu], y[:, iv] = ned_to_body(y[:, iu], y[:, iv], sensors.turned)
+        late = dict(sensors.late)
+        turns = self._over_ground and bool({"u", "v", "psi"} & late.keys())
+        if turns:
+            # they were late over ground: the ship heads elsewhere by then
+            heading = self.heading.reshape(-1, *[1] * (y.ndim - 2))
+            true = shifted(heading, -late.get("psi", 0.0) / self.sample_time)
+            y[:, iu], y[:, iv] = body_to_ned(y[:, iu], y[:, iv], true)
         for name, seconds in sensors.late:
             i = names.index(name)
             y[:, i] = shifted(y[:, i], seconds / self.sample_time)
+        if turns:
+            y[:, iu], y[:, iv] = ned_to_body(y[:, iu], y[:, iv], heading)
         for name in sensors.reversed:
             i = names.index(name)
             y[:, i] = -y[:, i]

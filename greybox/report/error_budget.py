@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from greybox.diagnosis.budget import SENSOR
-from greybox.diagnosis.result import BudgetPart, Diagnosis
+from greybox.diagnosis.result import BudgetPart, Diagnosis, told_share
 from greybox.report.figures import BLUE, LABELS, NAMES, ORANGE, new_figure, tidy
 from greybox.report.page import Table
 from greybox.validation.fit import fit_percent
@@ -54,16 +54,7 @@ def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
 def budget_table(budget: Sequence[BudgetPart]) -> Table:
     """Return the shares with their intervals."""
     states = list(budget[0].share)
-    rows = [
-        [
-            p.part,
-            *(
-                f"{100 * p.share[s]:.1f} ({100 * p.ci[s][0]:.1f} to {100 * p.ci[s][1]:.1f})"
-                for s in states
-            ),
-        ]
-        for p in budget
-    ]
+    rows = [[p.part, *(told_share(p, s) for s in states)] for p in budget]
     head = ["part", *(LABELS.get(s, s).split(" [")[0] for s in states)]
     caption = (
         "Sources of the squared held-out error before the model is extended [%] (95 % interval)"

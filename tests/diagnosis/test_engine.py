@@ -9,6 +9,7 @@ import pytest
 
 from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.evidence.held_out import long_run_variance, proof_of
+from greybox.diagnosis.extension import extended_vessel
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.linear import NOWHERE, sensitivities
@@ -17,15 +18,26 @@ from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.null_model import _as_it_should_be
 from greybox.diagnosis.point import Point
 from greybox.diagnosis.scores import ProjectedScores
-from greybox.diagnosis.ship import Change, LogRun, Sensors, Ship, shifted, wired
+from greybox.diagnosis.ship import (
+    Change,
+    LogRun,
+    Sensors,
+    Ship,
+    derived_motions,
+    shifted,
+    wired,
+)  # fmt: skip
 from greybox.diagnosis.simulator import VaryingSimulator
 from greybox.diagnosis.waves import find_waves
 from greybox.model.catalogue import get_structure
 from greybox.model.run.simulation import simulate
 from greybox.model.run.step import StepModel
+from greybox.rotation import body_to_ned, ned_to_body
 from greybox.study.blind import draw
 from greybox.study.chapter6 import TRUE
+from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
+from greybox.trial.steps import Step
 
 BASE = get_structure("thesis").without("Wuu", "Wvv", "Wuv")
 WIDE = BASE.with_terms("N_|r|r", "X_uuu", "Y_u*tauy")
@@ -167,6 +179,39 @@ def test_a_log_as_it_should_be_is_what_better_sensors_had_shown(log: TrialLog) -
     for i, name in enumerate(("u", "v", "r")):
         # the last samples of a channel that is two seconds late are not in the log
         np.testing.assert_allclose(mended[name][:-2], run.y[:-2, i], atol=1e-12)
+
+
+@pytest.mark.parametrize("late", ["u", "r"])
+def test_what_was_made_of_one_sensor_shares_its_clock(log: TrialLog, late: str) -> None:
+    made = [("u", "v"), ("r",)]
+    steps = tuple(Step("difference", c, ("x_n", "y_n", "psi"), {}) for c in made)
+    log = replace(log, provenance=replace(log.provenance, steps=steps))
+    run = LogRun(WIDE, log, "rk4")
+    context = Context(
+        BASE, log.vessel, run.outputs, False, float(log.t[-1]), 1.0, {},
+        derived=derived_motions(log),
+    )  # fmt: skip
+    cause = known_causes()["clock_offset"]
+    clocks = {h.key: h for h in cause.hypotheses(context)}
+    assert list(clocks) == ["clock_offset:u", "clock_offset:r"]
+    clock = clocks[f"clock_offset:{late}"]
+    pair = "u and v" if late == "u" else "r and psi"
+    said = cause.evidence_of(clock, {f"clock_{late}": (2.0, 0.1)})
+    assert said == f"{pair}, of one clock, come 2.00 ± 0.10 s too late against the other channels"
+    ship = clock.apply(Ship(_theta(WIDE), np.zeros(2), log.vessel), np.array([2.0]))
+    # velocities over ground of two seconds before, or turned by the heading of then
+    k = np.maximum(np.arange(len(log)) - (2 if late == "u" else 0), 0)
+    true = log["psi"] if late == "u" else shifted(log["psi"], -2.0)
+    north, east = body_to_ned(run.y[:, 0], run.y[:, 1], true)
+    u, v = ned_to_body(north[k], east[k], log["psi"])
+    seen = run.sense(ship.sensors, run.y[:, :, None])[:, :, 0]
+    np.testing.assert_allclose(seen[2:-2, :2], np.column_stack([u, v])[2:-2], atol=1e-12)
+    if late == "u":
+        # the vessel file that the model is written with takes it out again
+        vessel = extended_vessel(log.vessel, ship.sensors, (), log)
+        mended = correct_log(replace(log, channels={**log.channels, "u": u, "v": v}), vessel)
+        for i, name in enumerate("uv"):
+            np.testing.assert_allclose(mended[name], run.y[: len(mended), i], atol=1e-12)
 
 
 def test_a_change_is_two_runs(log: TrialLog) -> None:

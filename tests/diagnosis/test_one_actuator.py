@@ -9,6 +9,7 @@ import pytest
 from foreign_ships import manoeuvres, presets
 
 from greybox.diagnosis.causes import Context, known_causes
+from greybox.diagnosis.causes.hull import is_coupling
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.extension import extended_vessel
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
@@ -18,6 +19,7 @@ from greybox.diagnosis.search import Candidate, _taken
 from greybox.diagnosis.ship import Sensors, Ship
 from greybox.model.catalogue import structure_for
 from greybox.model.model import load_model
+from greybox.model.terms import parse_term
 from greybox.study.blind import draw
 from greybox.trial.convert.read import read_log
 from greybox.trial.log import make_log
@@ -64,6 +66,36 @@ def test_a_rudder_may_be_late_by_itself() -> None:
         lags["thruster_lag:delta"], {"lag": (2.0, 0.1)}
     )
     assert said == "delta alone acts with a time constant of 2.00 ± 0.10 s after it is logged"
+
+
+def test_a_rate_is_told_with_its_unit() -> None:
+    limits, cause = hypotheses(vessel(RUDDER), "rate_limit"), known_causes()["rate_limit"]
+    for column, rate in (("delta", "12.0 ± 1.0 deg/s"), ("n", "0.209 ± 0.017 n/s")):
+        told = {f"rate_{column}": (np.deg2rad(12.0), np.deg2rad(1.0))}
+        limit = limits[f"rate_limit:{column}"]
+        for way in (limit, limit.held_at(np.array([5.0]))):
+            assert cause.evidence_of(way, told) == (
+                f"{column} moves by at most {rate}, slower than it is logged"
+            )
+
+
+def test_the_thrust_of_one_thruster_couples_nothing() -> None:
+    for ship, all_told in ((vessel(RUDDER), False), (vessel(*PAIR), True)):
+        (found,) = hypotheses(ship, "inertia_coupling").values()
+        for name in ("Y_r", "N_v", "Y_taun", "N_tauy"):
+            told = all_told or "tau" not in name
+            assert is_coupling(parse_term(name), ship) == told
+            assert (parse_term(name).name in found.columns) == told
+        assert not is_coupling(parse_term("N_|taun|"), ship)
+
+
+def test_sensors_are_told_with_their_errors_and_directions() -> None:
+    bias, arm = (known_causes()[c] for c in ("heading_bias", "lever_arm"))
+    for sign, word in ((-1, "low"), (1, "high")):
+        said = bias.evidence({"heading_bias": (sign * np.deg2rad(1.87), np.deg2rad(0.24))})
+        assert said.endswith(f"as by a compass that reads 1.87 ± 0.24 deg too {word}")
+    said = arm.evidence({"lever_arm_x": (0.7, 7.3), "lever_arm_y": (-2.34, 0.27)})
+    assert "of a point 0.7 ± 7.3 m ahead and 2.34 ± 0.27 m to port of the origin" in said
 
 
 def test_angles_of_one_make_may_be_late_together() -> None:

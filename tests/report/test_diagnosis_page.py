@@ -29,6 +29,7 @@ from greybox.notebook import with_error
 from greybox.report.diagnosed_causes import probability
 from greybox.report.diagnosis import diagnosis_page
 from greybox.report.diagnosis_figures import command_figure, most_followed
+from greybox.report.error_budget import budget_table
 from greybox.report.error_profiles import block_ids, memory, profile
 from greybox.report.free_run_errors import gather
 from greybox.report.model_difference import (
@@ -275,6 +276,17 @@ def test_parts_that_do_not_add_up_are_said_to():
     (shown,) = (line for line in lines if line.startswith("  not split"))
     assert shown.count("  20.0 (") == 2
     assert "  -2310.0 (" in shown
+
+
+def test_a_share_that_may_be_any_is_not_told():
+    wide = {"u": (0.15, 0.25), "v": (-0.9, 1.0), "r": (-1.6, 1.8)}
+    budget = (BUDGET[0], replace(BUDGET[1], ci=wide), BUDGET[2])
+    named = replace(diagnosis_of("named"), budget=budget)
+    (line,) = (x for x in named.summary().splitlines() if x.startswith("  current  "))
+    assert line.split("  ")[-1].strip() == "cannot be split"
+    assert "70.0 (-90.0 to 100.0)" in line
+    assert budget_table(budget).rows[1][-1] == "cannot be split"
+    assert named.to_dict()["budget"][1]["ci"]["r"] == [-1.6, 1.8]
 
 
 def test_confused(told):

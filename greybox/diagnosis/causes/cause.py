@@ -45,6 +45,8 @@ class Context:
         Largest less smallest value of each command.
     fastest : mapping of str to float
         Fastest change of each command from sample to sample [per second].
+    derived : frozenset of str
+        Velocities and yaw rate that were made of other channels, and have the clock of those.
     """
 
     structure: Structure
@@ -57,6 +59,7 @@ class Context:
     current_known: bool = False
     ranges: Mapping[str, float] = field(default_factory=dict)
     fastest: Mapping[str, float] = field(default_factory=dict)
+    derived: frozenset[str] = frozenset()
 
     def lacking(self, *terms: str) -> tuple[str, ...]:
         """Return the named terms that the structure allows but does not contain.

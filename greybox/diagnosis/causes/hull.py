@@ -8,8 +8,9 @@ import numpy as np
 
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
-from greybox.model.terms import parameter_unit, parse_term
+from greybox.model.terms import Term, parameter_unit, parse_term
 from greybox.notebook import with_error
+from greybox.vessel.vessel import Vessel
 
 _WORDS = {"u": "surge", "v": "sway", "r": "yaw"}
 
@@ -37,6 +38,18 @@ def listed(values: Mapping[str, tuple[float, float]]) -> str:
 def equations(values: Mapping[str, tuple[float, float]]) -> str:
     """Return the motions that the named terms belong to."""
     return " and ".join(dict.fromkeys(_WORDS.get(parse_term(n).state, n) for n in values))
+
+
+def _couplings(vessel: Vessel) -> tuple[str, ...]:
+    """Return the linear cross terms of sway and yaw; thrust's where several thrusters tell it."""
+    # the force of one rudder, or one thruster, is its moment over a constant arm
+    thrust = ("Y_taun", "N_tauy") if len(vessel.thrusters) > 1 else ()
+    return ("Y_r", "N_v", *thrust)
+
+
+def is_coupling(term: Term, vessel: Vessel) -> bool:
+    """Whether a term is one of the coupled inertia of sway and yaw on this vessel."""
+    return term.key in {parse_term(name).key for name in _couplings(vessel)}
 
 
 class CubicDamping(Cause):
@@ -119,12 +132,8 @@ class InertiaCoupling(Cause):
     reference = "Fossen (2011), section 3.3"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return the linear cross terms together; thrust's where several thrusters tell it."""
-        names = ["Y_r", "N_v"]
-        if len(context.vessel.thrusters) > 1:
-            # the force of one rudder, or one thruster, is its moment over a constant arm
-            names += ["Y_taun", "N_tauy"]
-        lacking = context.lacking(*names)
+        """Return those that the structure lacks, together."""
+        lacking = context.lacking(*_couplings(context.vessel))
         return [term_hypothesis(self.id, lacking, context)] if lacking else []
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:

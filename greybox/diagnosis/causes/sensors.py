@@ -50,8 +50,8 @@ class HeadingBias(Cause):
         """Say by how much."""
         value, std = map(float, np.rad2deg(values["heading_bias"]))
         return (
-            f"surge and sway are turned against the ship's axes by {with_error(value, std)} deg, "
-            f"as by a compass that reads too high by as much"
+            f"surge and sway are turned against the ship's axes, as by a compass that reads "
+            f"{with_error(abs(value), std)} deg too {'high' if value > 0 else 'low'}"
         )
 
 
@@ -81,10 +81,11 @@ class LeverArm(Cause):
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say where the antenna is."""
-        x, y = values["lever_arm_x"][0], values["lever_arm_y"][0]
+        (x, dx), (y, dy) = values["lever_arm_x"], values["lever_arm_y"]
         return (
-            f"the velocities are those of a point {abs(x):.1f} m {'ahead' if x > 0 else 'abaft'} "
-            f"and {abs(y):.1f} m to {'starboard' if y > 0 else 'port'} of the origin"
+            f"the velocities are those of a point {with_error(abs(x), dx)} m "
+            f"{'ahead' if x > 0 else 'abaft'} and {with_error(abs(y), dy)} m to "
+            f"{'starboard' if y > 0 else 'port'} of the origin"
         )
 
 
@@ -99,26 +100,30 @@ class ClockOffset(Cause):
     reference = "Ljung (1999), section 14.3"
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
-        """Return one per channel."""
+        """Return one per clock: channels that were made of one sensor share it."""
         most = min(_LATEST, 0.1 * context.duration)
         out = []
-        for name in context.outputs:
-
-            def apply(ship: Ship, value: Array, name: str = name) -> Ship:
-                late = (*ship.sensors.late, (name, float(value[0])))
-                return replace(ship, sensors=replace(ship.sensors, late=late))
-
+        for names in _clocks(context):
+            name = names[0]
             parameter = Parameter(
                 f"clock_{name}", "s", 0.5 * context.sample_time, -most, most,
                 step=0.1 * context.sample_time, least=UNRESOLVED * context.sample_time,
             )  # fmt: skip
             out.append(
                 Hypothesis(
-                    self.id, f"{self.id}:{name}", (parameter,), (), apply,
+                    self.id, f"{self.id}:{name}", (parameter,), (), _Late(names),
                     starts=((3 * context.sample_time,), (-2 * context.sample_time,)),
                 )
             )  # fmt: skip
         return out
+
+    def evidence_of(self, hypothesis: Hypothesis, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say which, or which two, and how late."""
+        said = self.evidence(values)
+        names = hypothesis.apply.channels if isinstance(hypothesis.apply, _Late) else ()
+        if len(names) < 2:
+            return said
+        return said.replace(f"{names[0]} comes", f"{' and '.join(names)}, of one clock, come", 1)
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say which and how late."""
@@ -127,6 +132,27 @@ class ClockOffset(Cause):
             f"{name.removeprefix('clock_')} comes {with_error(abs(value), std)} s too "
             f"{'late' if value > 0 else 'early'} against the other channels"
         )
+
+
+@dataclass(frozen=True)
+class _Late:
+    """Makes the channels of one clock late by one number."""
+
+    channels: tuple[str, ...]
+
+    def __call__(self, ship: Ship, value: Array) -> Ship:
+        late = (*ship.sensors.late, *((name, float(value[0])) for name in self.channels))
+        return replace(ship, sensors=replace(ship.sensors, late=late))
+
+
+def _clocks(context: Context) -> list[tuple[str, ...]]:
+    """Return the channels of each clock: u and v from positions, r from the heading."""
+    shared = [
+        pair for pair, made in ((("u", "v"), {"u", "v"}), (("r", "psi"), {"r"}))
+        if made <= context.derived and set(pair) <= set(context.outputs)
+    ]  # fmt: skip
+    found = {name: pair for pair in shared for name in pair}
+    return list(dict.fromkeys(found.get(name, (name,)) for name in context.outputs))
 
 
 class Sign(Cause):

@@ -282,14 +282,15 @@ class RateLimit(Cause):
             # the number is the time of the whole way, which is zero without a limit
             quick = way / fastest
             times = [quick / share for share in _RATES]
+            unit = f"{context.vessel.unit(column) or 'n'}/s"
             parameter = Parameter(
-                f"rate_{column}", f"{context.vessel.unit(column) or 'n'}/s", times[0], 0.0,
+                f"rate_{column}", unit, times[0], 0.0,
                 quick / _LEAST_RATE, step=1e-3 * quick, least=quick, over=way,
             )  # fmt: skip
             out.append(
                 Hypothesis(
                     self.id, f"{self.id}:{column}", (parameter,), (), apply,
-                    tuple((t,) for t in times[1:]), only=True, past=True,
+                    tuple((t,) for t in times[1:]), unit=unit, only=True, past=True,
                 )
             )  # fmt: skip
         return out
@@ -301,6 +302,16 @@ class RateLimit(Cause):
             f"{name.removeprefix('rate_')} moves by at most {with_error(value, std)} per second, "
             f"slower than it is logged"
         )
+
+    def evidence_of(self, hypothesis: Hypothesis, values: Mapping[str, tuple[float, float]]) -> str:
+        """Say which and how fast, in its unit, angles in degrees."""
+        unit = hypothesis.unit
+        if unit == "rad/s":
+            unit = "deg/s"
+            values = {
+                n: (float(np.rad2deg(v)), float(np.rad2deg(s))) for n, (v, s) in values.items()
+            }
+        return self.evidence(values).replace("per second", unit, 1)
 
 
 class FeedbackSampling(Cause):

@@ -239,8 +239,9 @@ def _correct_velocities(
     """Correct u and v in place, between where they were measured and the origin."""
     (x0, y0), (x1, y1) = arms
     moved = not (_same(x0, x1) and _same(y0, y1))
-    heading = with_heading and "psi" in out and out["psi"] is not raw["psi"]
-    if not moved and not heading and not any(shifts):
+    late = any(shifts)
+    heading = with_heading and "psi" in out and (late or out["psi"] is not raw["psi"])
+    if not moved and not heading and not late:
         return
     u, v = out["u"], out["v"]
     if moved or x0 or y0:
@@ -249,7 +250,7 @@ def _correct_velocities(
     if heading:
         north, east = body_to_ned(u, v, raw["psi"])
         u, v = ned_to_body(_earlier(north, shifts[0]), _earlier(east, shifts[1]), out["psi"])
-    elif any(shifts):
+    elif late:
         u, v = _earlier(u, shifts[0]), _earlier(v, shifts[1])
     if moved or x0 or y0:
         rate = out["r"] if "r" in out else np.gradient(out["psi"], sample_time)
