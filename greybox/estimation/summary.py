@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 
+from greybox.estimation.prediction_verdict import JudgedOn
 from greybox.estimation.tried import told
 from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult
@@ -37,7 +38,11 @@ def summarise(estimate: EstimateValues) -> str:
     """Return the verdicts, the parameters in the manner of a regression table, and the tests."""
     lines = [f"{'Estimate of ' + estimate.vessel.name:^{WIDTH}}".rstrip(), "=" * WIDTH]
     if estimate.prediction is not None:
-        lines += _wrapped(f"Prediction: {estimate.prediction.text}", "  ")
+        judged = estimate.prediction
+        on = ""
+        if judged.judged_on is JudgedOn.VALIDATION:
+            on = f"; on {judged.judged_words}, {judged.samples * estimate.sample_time:.3g} s"
+        lines += _wrapped(f"Prediction: {judged.text}{on}", "  ")
     meant = estimate.meant
     lines += _wrapped(f"Coefficients: {meant.verdict.text}", "  ")
     if meant is not estimate:

@@ -711,6 +711,14 @@ def _finished(
     return estimate, diverged
 
 
+def _compass_unproven(log: TrialLog) -> bool:
+    """Whether velocities were made of a heading of which no bias is stated or mended."""
+    known = log.provenance
+    mended = any(s.operation == "turn_heading" for s in known.steps)
+    stated = "heading_bias" in log.vessel.sensors
+    return known.velocities_derived and not mended and not stated
+
+
 def with_runs(
     estimate: Estimate, logs: Sequence[TrialLog], notes: Sequence[str] = (), reason: str = ""
 ) -> tuple[Estimate, bool]:
@@ -735,6 +743,12 @@ def with_runs(
         own.append(
             f"{', '.join(estimate.predictor.contaminated)} also carry a second moment of the "
             f"current, which this structure cannot separate."
+        )
+    if estimate.current and any(_compass_unproven(log) for log in logs):
+        own.append(
+            "u and v were made of the heading, so no check can tell a bias of the compass: the "
+            "intervals of the current allow for none (state a known one as heading_bias in "
+            "[sensors])."
         )
     fit = average_fit(runs)
     diverged = any(r.diverged >= 0 for r in runs)

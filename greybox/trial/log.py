@@ -78,6 +78,11 @@ class Provenance:
         """What findings of the checks mended, one sentence each."""
         return tuple(s.sentence for s in self.steps if s.decided_by == "check")
 
+    @property
+    def velocities_derived(self) -> bool:
+        """Whether u or v was made of positions, or of velocities north and east, and heading."""
+        return any(s.derives_motion and {"u", "v"} & {*s.channels} for s in self.steps)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the provenance as JSON values: the steps, and beside them their sentences."""
         return {

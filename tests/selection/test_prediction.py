@@ -17,6 +17,7 @@ from greybox.selection.cross_validation import Refit
 from greybox.selection.estimate import estimate_model
 from greybox.selection.prediction import refit_alike, with_prediction
 from greybox.selection.request import Request
+from greybox.trial.steps import Step
 from greybox.validation.held_commands import held_commands_diverge
 
 ASKED = {"structure": "thesis", "predictor": "basic"}
@@ -140,6 +141,23 @@ def test_logs_given_to_validate_judge(estimate, logs):
     found = with_prediction(estimate, logs, Request(validate=(other,))).prediction
     assert found.judged_on is JudgedOn.VALIDATION
     assert "sway" in found.text
+    told = " ".join(replace(estimate, prediction=found).summary().split())
+    assert (
+        f"{found.text}; on 1 log kept from the estimate that was judged, 300 s Coefficients" in told
+    )
+
+
+@pytest.mark.parametrize(
+    ("made", "sensors", "said"),
+    [(True, {}, True), (False, {}, False), (True, {"heading_bias": 0.01}, False)],
+)
+def test_a_compass_that_nothing_checks_is_told_beside_the_current(made, sensors, said):
+    log = virtual_log(3, 300)
+    ship = replace(log.vessel, sensors={**log.vessel.sensors, **sensors})
+    steps = (Step("earth_to_body", ("u", "v"), ("v_n", "v_e", "psi")),) * made
+    log = replace(log, vessel=ship, provenance=replace(log.provenance, steps=steps))
+    found = estimate_model([log], method="ls", structure="thesis", predictor="wind")
+    assert any("no check can tell a bias of the compass" in n for n in found.notes) == said
 
 
 def test_a_refit_starts_where_the_estimate_ended(estimate, logs):

@@ -162,8 +162,7 @@ def find_manoeuvres(log: TrialLog, *, scale: float = 1.0) -> tuple[Manoeuvre, ..
 
 def _of_antenna(found: Sequence[Manoeuvre], log: TrialLog) -> Iterator[Manoeuvre]:
     """Note where turns are those of an antenna that the vessel file does not place."""
-    derived = any(s.derives_motion and {"u", "v"} & {*s.channels} for s in log.provenance.steps)
-    unplaced = derived and "antenna" not in log.vessel.sensors
+    unplaced = log.provenance.velocities_derived and "antenna" not in log.vessel.sensors
     for m in found:
         if unplaced and isinstance(m, TurningCircle):
             note = (
