@@ -98,7 +98,7 @@ class Hypothesis:
         What of the vessel it is of alone, such as the column of one command, where no name of its
         parameters tells it.
     unit : str
-        Of the number in its sentence, where that tells one: held at its values it has no parameters.
+        Of the number in its sentence, where that tells one; held, it has no parameters.
     only : bool
         Whether a ship has room for one hypothesis of this cause.
     past : bool
