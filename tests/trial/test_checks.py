@@ -171,6 +171,9 @@ def test_heading_bias_is_not_taken_for_the_current(degrees, ship):
     log = as_recording(recorded(80, 2.0, heading_bias=np.radians(degrees)))
     (found,) = check_recording(log, ship).findings
     assert found.id == "heading_bias"
+    std = np.degrees((found.ci[1] - found.ci[0]) / 2 / 1.96)
+    shown = float(found.evidence.split(" ± ")[1].split(" deg")[0])
+    assert shown == pytest.approx(std, rel=0.05)
     assert not found.safe
     assert abs(np.degrees(found.value) - degrees) < 0.5
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.notebook import with_error
 from greybox.numerics.parallel import map_forked
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import Motion
@@ -223,10 +224,9 @@ def _heading_finding(d: Defect) -> Finding:
         value,
         (value - 1.96 * std, value + 1.96 * std),
         "rad",
-        f"the heading is {np.degrees(abs(value)):.1f} deg "
+        f"the heading is {with_error(np.degrees(abs(value)), np.degrees(std))} deg "
         f"{'clockwise' if value > 0 else 'anticlockwise'} of the direction in which u and v carry "
-        f"the positions ({np.degrees(std) * 1.96:.1f} deg at 95 %); a constant velocity of the "
-        f"water is allowed for",
+        f"the positions (± one standard error); a constant velocity of the water is allowed for",
         f"subtract {value:.4f} rad from psi if the compass is misaligned (import --fix-also "
         f"heading_bias does), or turn u, v by as much if the velocity sensor is",
         ("psi",),
