@@ -15,7 +15,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.causes.hull import term_parameters
+from greybox.diagnosis.causes.hull import is_coupling, term_parameters
 from greybox.diagnosis.evidence.kinematics import denied
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
@@ -34,13 +34,16 @@ from greybox.model.terms import Term, parse_term
 from greybox.selection.cross_validation import Refit
 from greybox.selection.term_selection import TermChoice, select_terms
 from greybox.trial.log import TrialLog
+from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
 _AIR = {"uq", "vq"}
 _FLOW = {"v", "r"}
-_COUPLED = {("v", "r"), ("r", "v"), ("v", "taun"), ("r", "tauy")}
 _QUADRATIC = "quadratic_thrust"
+# defects of sensors that turn one velocity into another, and forces that look alike
+_TURNED = {"heading_bias", "lever_arm"}
+_LIKE_TURNED = {"asymmetry", "side_force", "inertia_coupling"}
 
 
 def from_chosen(
@@ -93,6 +96,7 @@ def from_chosen(
         fit, named, hypotheses = by_data, chosen, tuple(every)
     if fit is None:
         return None
+    fit, named = _with_sensors(case, fit, named, hypotheses)
     proof = case.held_out(fit.integrator).prove(plain, fit)
     names = case.problem(fit.integrator).names
     # each is weighed at the end, by leaving it out
@@ -189,6 +193,31 @@ def _none(_: Sequence[TrialLog]) -> NoReturn:
     raise ExcitationError("no model stands before.")
 
 
+def _with_sensors(
+    case: DiagnosisProblem, fit: Fit, named: list[Hypothesis], hypotheses: Sequence[Hypothesis]
+) -> tuple[Fit, list[Hypothesis]]:
+    """Return a fit and its causes, with the defects of sensors that the kinematics leave open.
+
+    The choice of terms knows no sensors, and its terms imitate them: an asymmetry of thrust turns
+    surge into sway as a compass bias does, coupled inertia the yaw rate as an antenna away from
+    the origin. One defect alone is then hardly seen. All together are in force where the fit is
+    likelier with them, each number at its price, and follows the held-out logs more nearly;
+    each is weighed at the end, as the terms are.
+    """
+    defects = [h for h in hypotheses if h.cause in _TURNED and h not in named]
+    if not defects or not any(h.cause in _LIKE_TURNED for h in named):
+        return fit, named
+    problem = case.problem(fit.integrator)
+    point = fit.point
+    for hypothesis in defects:
+        point = problem.add(point, hypothesis)
+    other = problem.settle(problem.fit(point, fit.noise), SETTLE)
+    price = np.log(problem.counts.sum()) * (len(point.vector()) - len(fit.point.vector()))
+    if other.escaped or other.cost + price > fit.cost or not _nearer(case, other, fit):
+        return fit, named
+    return other, [*named, *defects]
+
+
 def _nearer(case: DiagnosisProblem, fit: Fit, other: Fit) -> bool:
     """Whether a fit follows the held-out logs more nearly than another one."""
     one, two = (case.held_out(f.integrator).squares(f) for f in (other, fit))
@@ -206,7 +235,7 @@ def _hypotheses(
     context = context_of(structure.with_terms(*held), ready)
     grouped: dict[tuple[str, str], list[Term]] = {}
     for term in terms.terms:
-        cause = _cause_of(term, structure)
+        cause = _cause_of(term, structure, vessel)
         if cause is not None and cause in ready.causes:
             alone = cause in ("cubic_damping", "crossflow")
             grouped.setdefault((cause, term.name if alone else ""), []).append(term)
@@ -249,7 +278,7 @@ def _lacking(structure: Structure, terms: Structure) -> list[str]:
     return [t.name for t in terms.terms if t.key not in keys]
 
 
-def _cause_of(term: Term, structure: Structure) -> str | None:
+def _cause_of(term: Term, structure: Structure, vessel: Vessel) -> str | None:
     """Return the cause that a term stands for where a structure lacks it."""
     if any(t.key == term.key for t in structure.terms):
         return None
@@ -262,7 +291,7 @@ def _cause_of(term: Term, structure: Structure) -> str | None:
         return "cubic_damping"
     if term.name == "N_|r|r":
         return "quadratic_yaw_damping"
-    if (term.state, *signals) in _COUPLED:
+    if is_coupling(term, vessel):
         return "inertia_coupling"
     if term.state in _FLOW and term.even:
         return "asymmetry"
