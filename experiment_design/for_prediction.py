@@ -34,7 +34,7 @@ from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.regimes import start_words
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.diagnosis.result import finite
-from greybox.errors import InfeasibleError
+from greybox.errors import InfeasibleError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
 from greybox.numerics.threads import one_thread
@@ -278,11 +278,16 @@ def operating_envelope(
         build_predictor(named, "basic", tuple((s, (1, -1)) for s in request.structure.states)),
         structure=request.structure,
     )
+    ranges = command_ranges(model, given)
+    if lacking := [n for n in request.schedule.commands if n not in ranges]:
+        raise UsageError(
+            f"the prior is of '{model.vessel.name}', which has no {', '.join(lacking)} as "
+            f"'{request.vessel.name}' has: give a model of this ship, or leave --vessel out."
+        )
     rollout = build_problem(request).scenarios[0].rollout
     found = build_envelope(
-        rollout, predictor, request.noise, request.schedule, command_ranges(model, given), speeds,
-        misfit, request.seed,
-    )  # fmt: skip
+        rollout, predictor, request.noise, request.schedule, ranges, speeds, misfit, request.seed
+    )
     return found, level
 
 

@@ -45,9 +45,10 @@ def check_targets(*paths: str | Path | None) -> None:
         if target.is_dir():
             raise LogError(f"cannot write '{path}': it is a folder. Name a file in it.")
         if not target.parent.is_dir() or not os.access(target.parent, os.W_OK):
+            why = "you may not write in" if target.parent.is_dir() else "there is no"
             raise LogError(
-                f"cannot write '{path}': there is no folder '{target.parent}' to write in. "
-                f"Name a file in a folder that exists."
+                f"cannot write '{path}': {why} folder '{target.parent}'. Name a file in a folder "
+                f"that exists and is yours to write in."
             )
 
 
@@ -62,7 +63,7 @@ def nearest_file(path: str | Path, known: Iterable[str] = ()) -> str:
     """
     path = Path(path)
     try:
-        beside = [p.name for p in islice(path.parent.iterdir(), _MOST_NAMES)]
+        beside = [p.name for p in islice(path.parent.iterdir(), _MOST_NAMES) if p != path]
     except (OSError, ValueError):
         beside = []
     names = [*known, *beside]

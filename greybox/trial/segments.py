@@ -134,7 +134,7 @@ class LogGaps:
         several = self.count != 1
         where = (
             f"{'the longest of ' if several else ''}{self.longest:.4g} s of samples from "
-            f"t = {self.start:.6g} s on"
+            f"t = {self.start:.10g} s on"
         )
         if not self.channels:
             return (

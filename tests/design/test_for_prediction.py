@@ -379,6 +379,14 @@ def test_a_prior_that_cannot_hold_the_ship_is_refused() -> None:
         envelope_of(replace(request, theta=theta))
 
 
+def test_a_prior_of_another_ship_is_refused() -> None:
+    request, model = request_of(), thesis_model(spread=0.02)
+    thrusters = tuple(replace(t, speed="rpm") for t in model.vessel.thrusters)
+    other = replace(model, vessel=replace(model.vessel, name="tug", thrusters=thrusters))
+    with pytest.raises(UsageError, match="'tug', which has no n as '"):
+        design_for_prediction(request, other)
+
+
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     place = tmp_path_factory.mktemp("prediction")

@@ -49,7 +49,7 @@ def test_every_target_by_command(model, tmp_path, capsys):
         (["--to", "fmu", "--heading", "measured"], 1, "chooses its heading where it runs"),
         (["--to", "mat", "--no-binary"], 1, "only an FMU holds a binary, 'mat' does not"),
         (["--to", "c", "--out", "none/x.c"], 1, "there is no folder 'none'"),
-        (["--to", "c", "--out", "-"], 1, "'c' is written to a file"),
+        (["--to", "c", "--out", "-"], 1, "only --json writes to standard output"),
         (["--to", "c", "--out", "."], 1, "it is a folder"),
     ],
 )
