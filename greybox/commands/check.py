@@ -124,4 +124,4 @@ def run(options: argparse.Namespace) -> None:
             )
         if options.report:
             say(f"\nwrote {options.report}")
-        show_next(after_check(reports, record))
+        show_next(after_check(reports, vessel, record))

@@ -141,7 +141,7 @@ def check_page(
         headline=headline(reports),
         sections=sections,
         lead=lead,
-        next_steps=after_check(reports, record or {}),
+        next_steps=after_check(reports, vessel, record or {}),
         computed=made,
     )
     write_page(page, target)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from greybox.prediction.result import ManoeuvrePrediction
     from greybox.trial.checks.finding import CheckReport
     from greybox.validation.comparison import Comparison
+    from greybox.vessel.vessel import Vessel
 
 # files that a command line is still read with
 _MOST_TYPED = 3
@@ -119,7 +120,9 @@ def _use(model: str) -> NextStep:
     )
 
 
-def after_check(reports: Sequence[CheckReport], record: Mapping[str, Any]) -> list[NextStep]:
+def after_check(
+    reports: Sequence[CheckReport], ship: Vessel, record: Mapping[str, Any]
+) -> list[NextStep]:
     """Return what to do with the logs as they were found."""
     logs, vessel = typed(record, "logs", "LOG…"), typed(record, "vessel", "V")
     found = [f for r in reports for f in r.findings]
@@ -132,14 +135,18 @@ def after_check(reports: Sequence[CheckReport], record: Mapping[str, Any]) -> li
     if judged:
         also = " ".join(f"--fix-also {i}" for i in judged)
         steps.append(NextStep("Mend these too where their pictures convince you", f"{mend} {also}"))
-    blind = [r for r in reports if r.recording is not None and "psi" not in r.recording]
-    if not steps and blind:
-        steps.append(
-            NextStep(
-                f"Name the column of '{blind[0].name}' that holds the heading as psi, with its "
-                f"unit, in the vessel file's [columns]: models of sway and yaw need it"
-            )
+    lacking = [
+        f"Name the column of '{r.name}' that holds {what}, with its unit, in the vessel file's "
+        f"[columns]: {why}"
+        for r in reports
+        for name, what, why in (
+            ("psi", "the heading as psi", "models of sway and yaw need it"),
+            *((n, n, f"it moves the thrusters of '{ship.name}'") for n in ship.commands),
         )
+        if r.recording is not None and name not in r.recording
+    ]
+    if not steps and lacking:
+        steps.append(NextStep(lacking[0]))
     elif not steps:
         steps.append(
             NextStep(

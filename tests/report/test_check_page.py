@@ -351,11 +351,18 @@ def test_what_comes_next_is_a_model_only_of_logs_that_have_a_heading():
     c = columns()
     whole = report_of([], as_recording(c))
     blind = report_of([], as_recording({n: c[n] for n in ("t", "u", "v", "r", "n")}))
-    (step,) = after_check([whole], {})
+    (step,) = after_check([whole], SHIP, {})
     assert step.command.startswith("greybox estimate LOG… ")
-    (step,) = after_check([whole, blind], {})
+    (step,) = after_check([whole, blind], SHIP, {})
     assert step.command == ""
     assert "'virtual' that holds the heading as psi" in step.purpose
+
+
+def test_what_comes_next_is_a_model_only_of_logs_that_have_the_commands():
+    still = report_of([], as_recording({k: v for k, v in columns().items() if k != "n"}))
+    (step,) = after_check([still], SHIP, {})
+    assert step.command == ""
+    assert "'virtual' that holds n, with its unit" in step.purpose
 
 
 def test_headline_names_the_most_serious():
