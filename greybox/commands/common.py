@@ -105,27 +105,23 @@ def positive(text: str) -> float:
     return value
 
 
-def count(text: str) -> int:
-    """Return a whole number of at least 0, as an option's type."""
-    value = int(text)
-    if value < 0:
-        raise ValueError(text)
-    return value
-
-
 positive.__name__ = "positive number"
-count.__name__ = "whole number of at least 0"
 
 
-def at_least_one(text: str) -> int:
-    """Return a whole number of at least 1, as an option's type."""
-    value = int(text)
-    if value < 1:
-        raise ValueError(text)
-    return value
+def _whole(least: int) -> Callable[[str], int]:
+    """Return an option's type: a whole number of at least so much."""
+
+    def read(text: str) -> int:
+        value = int(text)
+        if value < least:
+            raise ValueError(text)
+        return value
+
+    read.__name__ = f"whole number of at least {least}"
+    return read
 
 
-at_least_one.__name__ = "whole number of at least 1"
+count, at_least_one = _whole(0), _whole(1)
 
 
 def add_seed(parser: argparse.ArgumentParser) -> None:

@@ -518,11 +518,17 @@ def hardly_split(budget: Sequence[BudgetPart]) -> str:
     )
 
 
+def is_split(part: BudgetPart, state: str) -> bool:
+    """Whether the logs tell the share of a part in a state's error from any other."""
+    low, high = part.ci[state]
+    return high - low <= _ANY
+
+
 def told_share(part: BudgetPart, state: str) -> str:
     """Return a share with its interval in percent, or that the logs do not tell it."""
-    low, high = part.ci[state]
-    if high - low > _ANY:
+    if not is_split(part, state):
         return "cannot be split"
+    low, high = part.ci[state]
     return f"{100 * part.share[state]:.1f} ({100 * low:.1f} to {100 * high:.1f})"
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from greybox.diagnosis.budget import SENSOR
-from greybox.diagnosis.result import BudgetPart, Diagnosis, told_share
+from greybox.diagnosis.result import BudgetPart, Diagnosis, is_split, told_share
 from greybox.report.figures import BLUE, LABELS, NAMES, ORANGE, new_figure, tidy
 from greybox.report.page import Table
 from greybox.validation.fit import fit_percent
@@ -63,11 +63,15 @@ def budget_table(budget: Sequence[BudgetPart]) -> Table:
 
 
 def largest(budget: Sequence[BudgetPart]) -> str:
-    """Return the largest part of each state in words."""
+    """Return the largest part of each state in words, of those that the logs tell."""
     told = []
     for state in budget[0].share:
-        part = max(budget, key=lambda p: p.share[state])
         name = LABELS.get(state, state).split(" [")[0]
+        parts = [p for p in budget if is_split(p, state)]
+        if not parts:
+            told.append(f"{name}: cannot be split")
+            continue
+        part = max(parts, key=lambda p: p.share[state])
         told.append(f"{name}: {part.part} {100 * part.share[state]:.0f} %")
     return "; ".join(told)
 

@@ -29,7 +29,7 @@ from greybox.notebook import with_error
 from greybox.report.diagnosed_causes import probability
 from greybox.report.diagnosis import diagnosis_page
 from greybox.report.diagnosis_figures import command_figure, most_followed
-from greybox.report.error_budget import budget_table
+from greybox.report.error_budget import budget_table, largest
 from greybox.report.error_profiles import block_ids, memory, profile
 from greybox.report.free_run_errors import gather
 from greybox.report.model_difference import (
@@ -287,6 +287,9 @@ def test_a_share_that_may_be_any_is_not_told():
     assert "70.0 (-90.0 to 100.0)" in line
     assert budget_table(budget).rows[1][-1] == "cannot be split"
     assert named.to_dict()["budget"][1]["ci"]["r"] == [-1.6, 1.8]
+    assert "current" in largest(BUDGET).split("; ")[-1]
+    assert "current" not in largest(budget).split("; ")[-1]
+    assert largest([replace(budget[1], ci=dict.fromkeys("uvr", (-1.6, 1.8)))]).count("split") == 3
 
 
 def test_confused(told):
