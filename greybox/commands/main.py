@@ -133,7 +133,8 @@ def _require_utf8(given: Sequence[str]) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line, by default that of the process, and return its exit status.
 
-    0 is done, 1 that the input is at fault; wrong usage is a SystemExit with 2.
+    0 is done, 1 that the input is at fault, 130 that Ctrl-C stopped it; wrong usage is a
+    SystemExit with 2.
     """
     if "_ARGCOMPLETE" in os.environ:
         offer(build_parser())
@@ -165,7 +166,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         complain("greybox: stopped")
-        return 1
+        return 130
     return 0
 
 

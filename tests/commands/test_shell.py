@@ -415,6 +415,31 @@ def test_closed_and_poor_streams_end_no_command(folder):
     assert "Cram\\xe9r" in done.stdout
 
 
+@pytest.mark.parametrize("module", ["argparse", "greybox.commands.estimate"])
+@pytest.mark.parametrize("as_extension", [False, True])
+def test_an_interrupt_while_modules_load_is_no_traceback(module, as_extension):
+    code = f"""
+import runpy, sys
+
+class Interrupted:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            try:
+                raise KeyboardInterrupt
+            except KeyboardInterrupt:
+                if {as_extension}:
+                    # as an extension module says it
+                    raise ImportError("initialization failed")
+                raise
+
+sys.meta_path.insert(0, Interrupted())
+sys.argv[1:] = ["estimate", "trial.csv"]
+runpy.run_module("greybox", run_name="__main__")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "greybox: stopped\n")
+
+
 def test_a_name_that_no_output_could_hold_is_refused(tmp_path, capsys):
     name = tmp_path / "F\udce4hrt.csv"
     assert main(["import", str(name), "--vessel", "thesis", "--out", str(tmp_path / "o.csv")]) == 1
