@@ -10,7 +10,7 @@ from glob import glob, has_magic
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from greybox.errors import LogError, UsageError
+from greybox.errors import GreyboxError, LogError, UsageError
 
 # what a folder or a pattern is searched for: records and reports stand beside logs
 ENDINGS = (".csv", ".parquet", ".pq")
@@ -100,42 +100,46 @@ def _found(path: str, names: list[str], within: str = "") -> list[LogFile]:
 
 def _at_address(path: str) -> list[LogFile]:
     """Return the logs at an address, which may be of one file, of a folder, or a pattern."""
-    files, own = _filesystem(path)
-    try:
+    with _reaching(path):
+        files, own = _filesystem(path)
         if has_magic(own):
             names = [files.unstrip_protocol(p) for p in files.glob(own) if files.isfile(p)]
             return _found(path, names)
         if files.isdir(own):
             names = [files.unstrip_protocol(p) for p in files.find(own)]
             return _found(path, names, files.unstrip_protocol(own))
-    except (OSError, ValueError) as error:
-        if isinstance(error, LogError):
-            raise
-        raise _out_of_reach(path, error) from None
     return [LogFile(path)]
 
 
 def _filesystem(path: str) -> tuple[Any, str]:
     """Return the file system of an address, and the path in it."""
-    try:
-        from fsspec.core import url_to_fs
+    from fsspec.core import url_to_fs
 
-        files, own = url_to_fs(path)
+    files, own = url_to_fs(path)
+    return files, str(own)
+
+
+@contextmanager
+def _reaching(path: str) -> Iterator[None]:
+    """Say in one sentence what keeps an address out of reach.
+
+    Each file system raises errors of its own kind, such as `ftplib.Error`.
+    """
+    try:
+        yield
+    except GreyboxError:
+        raise
     except ImportError as error:
         raise UsageError(
             f"the address '{path}' needs a package that is not installed ({error}): install it "
             f"with pip, or copy the files to this machine and name their folder."
         ) from None
-    except (OSError, ValueError) as error:
-        raise _out_of_reach(path, error) from None
-    return files, str(own)
-
-
-def _out_of_reach(path: str, error: Exception) -> LogError:
-    return LogError(
-        f"'{path}' cannot be reached: {str(error) or type(error).__name__}. Correct the address, "
-        f"or copy the files to this machine."
-    )
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+        raise LogError(
+            f"'{path}' cannot be reached: {reason}. Correct the address, or copy the files to this "
+            f"machine."
+        ) from None
 
 
 @contextmanager
@@ -150,11 +154,9 @@ def local_copy(path: str) -> Iterator[Path]:
     if not is_address(path):
         yield Path(path)
         return
-    files, own = _filesystem(path)
     with tempfile.TemporaryDirectory(prefix="greybox-") as folder:
-        copy = Path(folder) / PurePosixPath(own).name
-        try:
+        with _reaching(path):
+            files, own = _filesystem(path)
+            copy = Path(folder) / PurePosixPath(own).name
             files.get_file(own, str(copy))
-        except (OSError, ValueError) as error:
-            raise _out_of_reach(path, error) from None
         yield copy

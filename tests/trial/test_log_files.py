@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ftplib
 from pathlib import Path
 
 import pytest
@@ -62,5 +63,24 @@ def test_an_address_that_vanishes_is_named(folder: Path) -> None:
     with (
         pytest.raises(LogError, match=r"b\.csv' cannot be reached"),
         local_copy(files[1].path),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("error", [TypeError("no host"), ftplib.error_perm("530 no\nentry")])
+def test_whatever_a_file_system_raises_is_told_in_one_sentence(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    core = pytest.importorskip("fsspec.core")
+
+    def refuse(path: str) -> None:
+        raise error
+
+    monkeypatch.setattr(core, "url_to_fs", refuse)
+    with pytest.raises(LogError, match=r"x\.csv' cannot be reached: (no host|530 no entry)\. Corr"):
+        find_logs(["ftp:///x.csv"])
+    with (
+        pytest.raises(LogError, match="cannot be reached"),
+        local_copy("ftp:///x.csv"),
     ):
         pass
