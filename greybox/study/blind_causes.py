@@ -6,6 +6,7 @@ only drawn. Sizes are drawn from a range; `size` scales them towards no effect.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,6 +21,8 @@ Array = NDArray[np.float64]
 Value = float | str
 # the commands, in the order of a ship's programme
 COLUMNS = ("n1", "n2", "alpha1", "alpha2")
+# names of parameters that hold a place
+_PLACED = re.compile(r"(?:gain|rate|offset|clock)_(.+)|(.+)_factor|([XYN]_.+)")
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,14 @@ class Effect:
     def number(self, name: str) -> float:
         """Return a parameter that is a number."""
         return float(self.parameters[name])
+
+    @property
+    def places(self) -> frozenset[str]:
+        """Its actuators, coefficients or channel; empty where the id tells all."""
+        if "channel" in self.parameters:
+            return frozenset({str(self.parameters["channel"])})
+        found = [_PLACED.fullmatch(name) for name in self.parameters]
+        return frozenset(m[m.lastindex or 0] for m in found if m)
 
 
 @dataclass(frozen=True)

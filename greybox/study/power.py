@@ -6,11 +6,13 @@ not look at the truth, against which its judgement is counted.
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import zip_longest
 
 import numpy as np
 
@@ -50,6 +52,9 @@ class Judgement:
         Values and standard errors of the named causes' parameters.
     gain : mapping of str to float
         Fit (6.12) on the validation log after the extension less before [%]: u, v, r.
+    places : tuple of str
+        Of the causes, in their order: the id with the actuator, coefficient or channel, as
+        ``thruster_gain:n1``. Where a judge tells none the ids alone are compared.
     """
 
     verdict: str
@@ -57,6 +62,7 @@ class Judgement:
     groups: tuple[tuple[str, ...], ...] = ()
     parameters: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     gain: Mapping[str, float] = field(default_factory=dict)
+    places: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,7 @@ def judge_by_diagnosis(trial: Trial) -> Judgement:
         found.groups,
         {name: (q.value, q.std) for c in found.causes for name, q in c.parameters.items()},
         {state: g.after - g.before for state, g in found.gain.items()},
+        tuple(c.key for c in found.causes),
     )
 
 
@@ -148,17 +155,31 @@ class Outcome:
         return self.judgement is not None and self.judgement.verdict != DiagnosisVerdict.NONE
 
     @property
+    def named(self) -> tuple[str, ...]:
+        """The causes that are named, with ``elsewhere`` where the true one has another place."""
+        if self.judgement is None:
+            return ()
+        true = {e.id: e.places for e in self.truth}
+        return tuple(
+            f"{name} elsewhere"
+            if place and true.get(name) and true[name].isdisjoint(re.split("[:+]|sign_", place))
+            else name
+            for name, place in zip_longest(self.judgement.ids, self.judgement.places)
+        )
+
+    @property
     def answer(self) -> str:
         """How the judgement compares with the truth.
 
-        ``right``: all causes named, no other, and nothing left; an effect that has no name left
-        unexplained; nothing found where nothing is. ``part``: some of them named, or
-        others beside them. ``group``: confused, every cause being in a group. ``failed``,
-        ``none``, ``unexplained`` and ``wrong`` are what is left.
+        ``right``: all causes named with their place (which actuator, coefficient or channel), no
+        other, and nothing left; an effect that has no name left unexplained; nothing found where
+        nothing is. ``part``: some of them named, or others beside them. ``group``: confused,
+        every cause being in a group. ``failed``, ``none``, ``unexplained`` and ``wrong`` are
+        what is left.
         """
         if self.judgement is None:
             return "failed"
-        verdict, ids = self.judgement.verdict, set(self.judgement.ids)
+        verdict, ids = self.judgement.verdict, set(self.named)
         true = set(self.cell.effects)
         nameless = bool(true) and true <= set(UNKNOWN)
         members = {i for group in self.judgement.groups for i in group}
@@ -180,7 +201,7 @@ class Outcome:
         if self.judgement.verdict == DiagnosisVerdict.CONFUSED:
             return "group with it" if self.answer == "group" else "group without"
         if self.judgement.verdict in (DiagnosisVerdict.NAMED, DiagnosisVerdict.PARTLY):
-            return self.judgement.ids[0]
+            return self.named[0]
         return self.judgement.verdict
 
 

@@ -50,6 +50,31 @@ def test_each_answer_is_counted_as_what_it_is(given, answer, found):
     assert one.detected == (given[1] != "none")
 
 
+@pytest.mark.parametrize(
+    ("effect", "parameters", "place", "rightly"),
+    [
+        ("thruster_gain", {"gain_n2": 0.7}, "thruster_gain:n2:1", True),
+        ("thruster_gain", {"gain_n2": 0.7}, "thruster_gain:n1:0", False),
+        ("clock_offset", {"clock_u": 2.0}, "clock_offset:u:kinematics", True),
+        ("clock_offset", {"clock_u": 2.0}, "clock_offset:v", False),
+        ("parameter_change", {"Yv_factor": 2.0, "Yv_time": 9.0}, "parameter_change:Yv", True),
+        ("parameter_change", {"Yv_factor": 2.0, "Yv_time": 9.0}, "parameter_change:Yvr", False),
+        ("cubic_damping", {"X_uuu": -0.1}, "cubic_damping:Y_vvv", False),
+        ("asymmetry", {"Y_taux": 0.1, "N_taux": 0.1}, "asymmetry:N_taux+Y_taux", True),
+        ("asymmetry", {"Y_taux": 0.1, "N_taux": 0.1}, "asymmetry:N_|u|u+Y_|u|u", False),
+        ("sign", {"channel": "alpha1"}, "sign:sign_alpha1", True),
+        ("sign", {"channel": "alpha1"}, "sign:swapped_alpha1_alpha2", False),
+        ("current", {"current_north": 0.3}, "current", True),
+    ],
+)
+def test_a_cause_of_another_place_is_named_wrongly(effect, parameters, place, rightly):
+    cell = Cell((effect,), 1.0, "manoeuvres")
+    judged = Judgement("named", (effect,), places=(place,))
+    one = Outcome(cell, 0, (Effect(effect, parameters),), judged)
+    assert one.answer == ("right" if rightly else "wrong")
+    assert one.found == effect + (" elsewhere" * (not rightly))
+
+
 def test_intervals_are_those_of_wilson():
     for hits, runs in ((0, 10), (3, 17), (20, 20), (5, 100)):
         expected = proportion_confint(hits, runs, method="wilson")
