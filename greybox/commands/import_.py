@@ -151,6 +151,7 @@ def run(options: argparse.Namespace) -> None:
         raw_files,
         targets,
     )
+    from greybox.trial.readers.formats import has_topics
     from greybox.trial.store import read_record, record_path
     from greybox.vessel.conditions import UNITS
     from greybox.vessel.toml import load_vessel
@@ -162,6 +163,12 @@ def run(options: argparse.Namespace) -> None:
         )
     raw = raw_files(options.raw)
     require_each_once(raw)
+    topics = pairs(options.topic, "--topic", "TOPIC=NAME")
+    if topics and not any(map(has_topics, raw)):
+        raise UsageError(
+            f"--topic names {', '.join(topics)}, and none of the {len(raw)} raw files is a ROS bag "
+            f"or an MCAP file: name the bag, or leave --topic out."
+        )
     folder = is_folder(raw, options.out)
     if not folder and Path(options.out).suffix.lower() not in ("", *LOG_SUFFIXES):
         raise UsageError(
@@ -182,7 +189,7 @@ def run(options: argparse.Namespace) -> None:
         fix=options.fix,
         fix_also=tuple(options.fix_also),
         fix_not=tuple(options.fix_not),
-        reader={"topics": pairs(options.topic, "--topic", "TOPIC=NAME")} if options.topic else {},
+        reader={"topics": topics} if topics else {},
         extra=provenance(options),
     )
     if options.json:

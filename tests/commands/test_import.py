@@ -441,6 +441,11 @@ def test_topics_of_a_bag_are_chosen_and_named(tmp_path, capsys):
         status, _, err = run(capsys, *arguments, "--topic", given)
         assert status == 1
         assert words in err
+    table = ("import", tmp_path / "log.csv", *arguments[2:-1], tmp_path / "again.csv")
+    status, _, err = run(capsys, *table, "--topic", "/nav=psi")
+    assert status == 1
+    assert "--topic names /nav, and none of the 1 raw files is a ROS bag" in err
+    assert not (tmp_path / "again.csv").exists()
 
 
 @pytest.mark.parametrize("cells", [None, 0], ids=["memory", "blocks"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,13 @@ from virtual import as_recording, recorded
 from greybox.errors import LogError, UsageError
 from greybox.trial.checks.check import check_files, check_recording
 from greybox.trial.checks.course import course_findings
-from greybox.trial.checks.finding import IDS
+from greybox.trial.checks.finding import IDS, exact_finding, factor_of
 from greybox.trial.checks.thruster_response import answer_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs, repair
+from greybox.trial.steps import mend
 from greybox.vessel.toml import load_vessel, vessel_from_dict
 
 KNOT = 1852 / 3600
@@ -265,6 +267,14 @@ def test_the_side_on_which_the_course_lies_needs_no_sign(turned, side):
         as_recording({"t": t, **columns, **level}), load_vessel("thesis")
     )
     assert f"the course lies {side}" in found.evidence
+
+
+def test_the_heading_bias_is_told_as_it_is_valued(ship):
+    """Not the mean drift angle, of which a current and the turning are part."""
+    columns = {n: v for n, v in recorded(0, 1.0).items() if n in ("t", "x_n", "y_n", "psi")}
+    columns["psi"] = columns["psi"] + np.radians(75)
+    ((found,), _) = course_findings(as_recording(columns), ship)
+    assert f"the course lies {np.degrees(found.value):.0f} deg to port" in found.evidence
 
 
 def turning_in_wind():
@@ -601,6 +611,14 @@ def test_planted_offsets_are_found(ship, monkeypatch):
     assert all(n >= least for n in found.values()), found
 
 
+def test_what_is_exchanged_or_reversed_is_told_so_and_not_by_a_nought():
+    exchanged = exact_finding("sign", ("psi", "r"), 0.0, "1", "they are swapped", "exchange them")
+    assert exchanged.line == "sign (psi, r): exchanged"
+    angles = ("alpha1", "alpha2")
+    assert factor_of((mend("scale", angles, factor=-1.0),)) == -1.0
+    assert factor_of((mend("exchange", angles),)) == 0.0
+
+
 @pytest.mark.parametrize("late", [{}, {"u": 2.0, "v": 2.0}])
 def test_readings_of_long_logs_are_judged_on_parts_of_them(ship, monkeypatch, late):
     monkeypatch.setattr("greybox.trial.checks.frame_sign_unit._EXCERPT", 400)
@@ -617,6 +635,9 @@ def test_a_file_named_twice_is_no_second_log(tmp_path, ship):
     )  # fmt: skip
     with pytest.raises(UsageError, match=r"'a\.csv' is named 2 times"):
         check_files([path, path.parent / "." / "a.csv"], ship)
+    shutil.copy(path, tmp_path / "copy.csv")
+    with pytest.raises(UsageError, match=r"'a\.csv' and 'copy\.csv' are the same recording"):
+        check_files([path, tmp_path / "copy.csv"], ship)
 
 
 def test_without_positions_nothing_is_said_of_them(ship):

@@ -94,7 +94,7 @@ def check_files(paths: Sequence[str | Path], vessel: Vessel) -> list[CheckReport
     LogError
         A file cannot be read.
     UsageError
-        A file is named twice: its evidence would count twice.
+        A file is named twice, or a copy of it: its evidence would count twice.
     """
     require_each_once(paths)
     return check_recordings([read_recording(path, vessel) for path in paths], vessel)
@@ -151,7 +151,22 @@ def check_recordings(
     -------
     list of CheckReport
         One a recording, in their order: findings by id, and what became of every check.
+
+    Raises
+    ------
+    UsageError
+        Two are of the same file, or of copies of one: its evidence would count twice.
     """
+    known: dict[tuple[str, ...], str] = {}
+    for k, recording in enumerate(recordings):
+        content = tuple(f.sha256 for f in recording.files) or (str(k),)
+        name = ", ".join(f.name for f in recording.files)
+        if content in known:
+            raise UsageError(
+                f"'{known[content]}' and '{name}' are the same recording, byte for byte, and would "
+                f"count as 2 logs: name one of them."
+            )
+        known[content] = name
     logs = [_signal_quality(recording, vessel) for recording in recordings]
     _kinematics(logs, vessel)
     actuators: tuple[ActuatorEstimate, ...] = ()

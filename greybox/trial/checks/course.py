@@ -150,10 +150,10 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
         bias,
         (bias - half, bias + half),
         "rad",
-        f"under way the course lies {abs(np.degrees(angle)):.0f} deg "
-        f"{'to starboard' if angle > 0 else 'to port'} of the heading on all headings (over "
-        f"{np.degrees(spread):.0f} deg): a vessel does not go so sideways, its compass or antenna "
-        f"pair is turned",
+        f"beside a current and the drift of turning, the course lies "
+        f"{abs(np.degrees(bias)):.0f} deg to {'starboard' if bias < 0 else 'port'} of the heading "
+        f"on all headings (over {np.degrees(spread):.0f} deg): a vessel does not go so sideways, "
+        f"its compass or antenna pair is turned",
         f"subtract {bias:.3f} rad from psi once its mounting is known (import --fix-also "
         f"heading_bias does)",
         ("psi",),

@@ -16,6 +16,8 @@ IDS = (
     "clock_offset", "lever_arm", "heading_bias",
     "heading_wrap", "position_jump", "position_hold", "time_format", "external_force", "actuator",
 )  # fmt: skip
+# what a channel is instead of being multiplied by a value, which then is 0
+_INSTEAD = {"sign": "exchanged", "frame": "other axes"}
 
 
 @dataclass(frozen=True, repr=False)
@@ -113,6 +115,11 @@ def exact_finding(
         id, channels[0], value, interval, unit, evidence, fix, channels, repair, safe,
         picture or {}, logs,
     )  # fmt: skip
+
+
+def factor_of(repair: Sequence[Step]) -> float:
+    """Return by what channels that a repair multiplies are wrong; 0 where it does not."""
+    return next((1 / s.number("factor") for s in repair if s.operation == "scale"), 0.0)
 
 
 def declare_unit(names: Sequence[str], unit: str) -> str:
@@ -233,6 +240,8 @@ def size_in_words(f: Finding) -> str:
         parts = [f"{v:.3g} ({c[0]:.3g} to {c[1]:.3g})" for v, c in zip(f.value, f.ci, strict=True)]
         return f"{', '.join(parts)} {f.unit}"
     unit = "" if f.unit == "1" else f" {f.unit}"
+    if f.value == 0 and f.id in _INSTEAD:
+        return _INSTEAD[f.id]
     if f.ci[0] == f.ci[1]:
         return f"{f.value:.4g}{unit}"
     return f"{f.value:.3g} ({f.ci[0]:.3g} to {f.ci[1]:.3g}){unit}"

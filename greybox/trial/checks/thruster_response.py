@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.checks.finding import Finding, exact_finding
+from greybox.trial.checks.finding import Finding, exact_finding, factor_of
 from greybox.trial.checks.motion import (
     Motion,
     Profile,
@@ -191,12 +191,11 @@ def _moves(recording: Recording, channels: Sequence[str]) -> bool:
 
 
 def _finding(a: _Alternative, gain: float, count: int, names: tuple[str, ...]) -> Finding:
-    value = -1.0 if len(a.repair[0].channels) == 1 else 0.0
     beside = f" in {count} logs together" if count > 1 else ""
     return exact_finding(
         "sign",
         a.channels,
-        value,
+        factor_of(a.repair),
         "1",
         f"the ship answers as if {a.words}: read so, the force explains its motion far better "
         f"(log-likelihood higher by {gain:.0f}{beside}); a check of response, not of kinematics",

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.trial.checks.finding import Finding, exact_finding
+from greybox.trial.checks.finding import Finding, exact_finding, factor_of
 from greybox.trial.checks.motion import make_motion, smooth, to_ned
 from greybox.trial.raw_log import Recording
 from greybox.trial.steps import Step, mend
@@ -110,12 +110,11 @@ def wind_findings(recording: Recording, findings: list[Finding]) -> list[Finding
     tied = "x_n" in recording and "y_n" in recording
     doubt = "" if tied else "; without positions u, v or psi may be at fault instead"
     option = "--fix" if tied else f"--fix-also {convention.id}"
-    value = -1.0 if any(s.operation == "scale" for s in convention.repair) else 0.0
     return [
         exact_finding(
             convention.id,
             convention.channels,
-            value,
+            factor_of(convention.repair),
             "1",
             f"{convention.words}: read so, the true wind is {ratio:.1f} times steadier while the "
             f"ship turns over {np.degrees(np.ptp(psi)):.0f} deg{doubt}",

@@ -124,6 +124,17 @@ def is_bag(folder: Path) -> bool:
     return (folder / "metadata.yaml").exists()
 
 
+def has_topics(path: str | Path) -> bool:
+    """Whether a raw file is a bag, or an MCAP file, whose topics can be chosen.
+
+    Raises
+    ------
+    LogError
+        As `open_raw`.
+    """
+    return _kind(Path(path)) == "ros"
+
+
 def _kind(path: Path) -> str:
     try:
         there = path.exists()
