@@ -9,7 +9,9 @@ the choice of terms, too.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from typing import NoReturn
 
 import numpy as np
@@ -31,6 +33,7 @@ from greybox.errors import ExcitationError, GreyboxError
 from greybox.model.disturbances import TURNING
 from greybox.model.structure import Structure
 from greybox.model.terms import Term, parse_term
+from greybox.numerics.parallel import ahead
 from greybox.selection.cross_validation import Refit
 from greybox.selection.term_selection import TermChoice, select_terms
 from greybox.trial.log import TrialLog
@@ -46,11 +49,38 @@ _TURNED = {"heading_bias", "lever_arm"}
 _LIKE_TURNED = {"asymmetry", "side_force", "inertia_coupling"}
 
 
+class Choosing:
+    """A choice of terms that is begun before it is known to be needed.
+
+    Parameters
+    ----------
+    begun : ExitStack
+        With which the work ends.
+    """
+
+    def __init__(self, begun: ExitStack) -> None:
+        self._begun = begun
+        self._vessel: Vessel | None = None
+        self._found: Callable[[], TermChoice | None]
+
+    def begin(self, logs: Sequence[TrialLog]) -> None:
+        """Begin it of logs; what was begun for another vessel than theirs ends."""
+        if self._vessel != logs[0].vessel:
+            self._begun.close()
+            self._vessel = logs[0].vessel
+            self._found = self._begun.enter_context(ahead(partial(_choice_of, logs)))
+
+    def of(self, logs: Sequence[TrialLog]) -> TermChoice | None:
+        """Return the terms that logs choose; None where they choose none."""
+        self.begin(logs)
+        return self._found()
+
+
 def from_chosen(
     ready: Prepared,
     searched: Search,
     found: Search,
-    begun: Callable[[], TermChoice | None],
+    choosing: Choosing,
     progress: Callable[[str], None],
 ) -> tuple[DiagnosisProblem, Search] | None:
     """Search with errors weighed by their size alone; None where that predicts no better.
@@ -64,14 +94,13 @@ def from_chosen(
         Without a model of its own.
     searched, found : Search
         From (3.51), before and after its causes were weighed.
-    begun : callable
-        Returns the choice of terms (`choice_of`) of the logs as they are.
+    choosing : Choosing
     progress : callable
     """
     progress("terms that the data choose")
     late = _late(ready.case, found)
     ready = replace(ready, case=ready.case.acting(found.final.point.ship.vessel)) if late else ready
-    choice = choice_of(ready.case.logs) if late else begun()
+    choice = choosing.of(ready.case.logs)
     states = ready.case.structure.states
     if choice is not None and not set(choice.terms.structure.states) <= set(states):
         # the terms of motions that this structure leaves out are none of it
@@ -179,10 +208,10 @@ def _bounded(case: DiagnosisProblem, starts: Sequence[Point], noise: Noise) -> l
     return best
 
 
-def choice_of(logs: Sequence[TrialLog]) -> TermChoice | None:
+def _choice_of(logs: Sequence[TrialLog]) -> TermChoice | None:
     """Return the terms that logs choose; None where they choose none."""
     try:
-        found = select_terms(logs, "no model", 0, Refit(_none))
+        found = select_terms(logs, "no model", 0, Refit(_none), stepped=False)
     except GreyboxError:
         return None
     # what can be sent from one process to another

@@ -6,21 +6,20 @@ import logging
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
 from greybox.diagnosis.black_box import with_remainder
 from greybox.diagnosis.builder import DiagnosisBuilder
-from greybox.diagnosis.chosen import choice_of, from_chosen
+from greybox.diagnosis.chosen import Choosing, from_chosen
 from greybox.diagnosis.evidence.kinematics import causes_of, denied
+from greybox.diagnosis.point import Fit
 from greybox.diagnosis.preparing import SHORTEST, prepare, with_own_sensors
 from greybox.diagnosis.result import Diagnosis
 from greybox.diagnosis.ruling import leaves_more
 from greybox.diagnosis.search import search, weighed
 from greybox.diagnosis.waves import find_waves, found_waves
 from greybox.model.model import ManoeuvringModel
-from greybox.numerics.parallel import ahead
 from greybox.numerics.threads import one_thread
 from greybox.public import known_keywords
 from greybox.regression.regression import common_sample_time
@@ -127,20 +126,31 @@ def diagnose(
     if model is None and options.own_pace:
         logs, validate = _at_own_pace(logs, validate, paced)
     with ExitStack() as begun:
-        # most models turn out to need it, and not all before keeps all processors busy
-        terms = ahead(partial(choice_of, with_own_sensors(logs)))
-        choice = begun.enter_context(terms) if model is None else None
+        choosing = Choosing(begun) if model is None else None
+        if choosing is not None:
+            # most models turn out to need it, and not all before keeps all processors busy
+            choosing.begin(with_own_sensors(logs))
         ready = prepare(logs, validate, model, options.structure, options.causes)
         case = ready.case
-        if ready.findings and choice is not None:
+        if ready.findings and choosing is not None:
             # the checks mended the logs that it began with
-            begun.close()
-            choice = begun.enter_context(ahead(partial(choice_of, case.logs)))
+            choosing.begin(case.logs)
+
+        def choose_late(fit: Fit) -> None:
+            """Begin anew where commands act later than the logs say."""
+            if choosing is not None and any(h.past for h in fit.point.hypotheses):
+                choosing.begin(case.acting(fit.point.ship.vessel).logs)
+
         say("model without causes")
         base = ready.base()
         problem = case.problem(base.integrator)
         searched = search(
-            case, base, ready.hypotheses, progress=options.progress, alone=model is not None
+            case,
+            base,
+            ready.hypotheses,
+            progress=options.progress,
+            alone=model is not None,
+            unexplained=choose_late,
         )
         say("a generic force beside the causes")
         found = weighed(case, searched)
@@ -156,8 +166,8 @@ def diagnose(
             found = weighed(case, searched)
             more = leaves_more(found, case.held_out)
         found = replace(found, given=ready.as_given())
-        if choice is not None and more:
-            chosen = from_chosen(ready, searched, found, choice, say)
+        if choosing is not None and more:
+            chosen = from_chosen(ready, searched, found, choosing, say)
             if chosen is not None:
                 wider, mine = chosen
                 mine = weighed(wider, mine)

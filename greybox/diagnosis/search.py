@@ -203,6 +203,7 @@ def search(
     most: int = MOST_CAUSES,
     alone: bool = True,
     progress: Callable[[str], None] = lambda _: None,
+    unexplained: Callable[[Fit], None] = lambda _: None,
 ) -> Search:
     """Look for causes until held-out logs confirm no further one.
 
@@ -224,6 +225,8 @@ def search(
         Whether no other search may follow.
     progress : callable
         Told what is being done.
+    unexplained : callable
+        Told a fit that leaves forces of motion and commands, where another search may follow.
     """
     steps: list[Step] = []
     fit = base
@@ -243,6 +246,7 @@ def search(
         left = not alone and _left_to_motion(case, fit)
         fit, causes = _with(case, causes, step.taken, tried)
         if left and _left_to_motion(case, fit):
+            unexplained(fit)
             more = _completed(case, fit, causes, hypotheses) if len(causes) < most else None
             if more is not None:
                 second, fit, causes = more

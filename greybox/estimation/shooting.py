@@ -23,6 +23,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 from scipy.sparse import block_diag, bmat, csc_matrix
 from scipy.sparse.linalg import splu
 
@@ -370,8 +371,6 @@ def solve_step(
     step = (root @ (root.T @ (gradient / scale))) / scale
     if (step >= low).all() and (step <= high).all():
         return np.asarray(step)
-    from scipy.optimize import lsq_linear
-
     known = np.isfinite(values)
     factor = np.sqrt(values[known])[:, None] * vectors[:, known].T
     target = (vectors[:, known].T @ (gradient / scale)) / np.sqrt(values[known])

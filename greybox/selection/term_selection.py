@@ -139,6 +139,8 @@ def select_terms(
     present: str,
     size: int,
     refit: Refit,
+    *,
+    stepped: bool = True,
 ) -> TermChoice:
     """Choose terms by free runs on parts that were left out, and compare with a present model.
 
@@ -152,6 +154,8 @@ def select_terms(
         Its coefficients.
     refit : Refit
         Estimates it on other logs.
+    stepped : bool
+        Whether ways over a sample are compared for the terms, too.
 
     Raises
     ------
@@ -282,7 +286,7 @@ def select_terms(
         return np.asarray(np.array(score) * weight / weight.mean())
 
     own, *rest = _steps(logs)
-    steps = _compare_steps([own, *rest], score_step) if chosen else []
+    steps = _compare_steps([own, *rest], score_step) if chosen and stepped else []
     error = 100 - max((score for _, score, _, _ in steps), default=0.0)
     near = _GIVEN_AWAY / 100 * error
     step = next((s for s, _, behind, se in steps if behind <= max(se, near)), own)
