@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.rotation import ned_to_body
 from greybox.trial.log import TrialLog
+from greybox.trial.raw_log import Array, Mask
 from greybox.trial.steps import Step
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # corrections of derived velocities that those of the positions and heading imply
 _FOLLOWED = frozenset({"turn_heading", "move_velocity"})
@@ -119,8 +117,9 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
     made = [Step("decimate", tuple(channels), parameters={
         "measured": log.sample_time, "sample_time": sample_time})]  # fmt: skip
     made += _differences(log, channels, sample_time)
-    anew = {n for s in made[1:] for n in s.channels}
-    then = list(made[1:])
+    then = made[1:]
+    anew = {n for s in then for n in s.channels}
+    measured = {n: gap for n, gap in log.missing.items() if n not in anew}
     if any(_antenna(log)):
         then.append(Step("move_velocity", ("u", "v"), ("r",)))
     out = replace(
@@ -129,13 +128,7 @@ def decimate(log: TrialLog, sample_time: float) -> TrialLog:
         t=log.t[centres],
         channels=channels,
         closed_loop=log.closed_loop[centres],
-        missing=carried_gaps(
-            _without_means(
-                {n: gap for n, gap in log.missing.items() if n not in anew}, centres - half, step
-            ),
-            then,
-            sample_time,
-        ),
+        missing=carried_gaps(_without_means(measured, centres - half, step), then, sample_time),
         provenance=replace(log.provenance, steps=(*log.provenance.steps, *made)),
     )
     if len(made) == 1:
@@ -238,23 +231,21 @@ def decimate_segments(
         except _TooShortError as error:
             refused = refused or error
             notes.append(
-                f"'{log.name}' was left out: its {len(log)} samples ({_duration(log):.3g} s) are "
-                f"too few for a sample time of {sample_time:g} s."
+                f"'{log.name}' was left out: its {len(log)} samples "
+                f"({len(log) * log.sample_time:.3g} s) are too few for a sample time of "
+                f"{sample_time:g} s."
             )
     if refused is not None and not kept:
         raise refused
     return kept, tuple(notes)
 
 
-def _duration(log: TrialLog) -> float:
-    return len(log) * log.sample_time
-
-
 def _differences(log: TrialLog, channels: dict[str, Array], sample_time: float) -> list[Step]:
     """Make anew, in place, what central differences made; return the steps."""
-    by_difference = {n: s for n in ("u", "v", "r") if (s := _last_made(log, n)) is not None}
     by_difference = {
-        n: s for n, s in by_difference.items() if n in channels and channels.keys() >= {*s.source}
+        n: s
+        for n in ("u", "v", "r")
+        if (s := _last_made(log, n)) is not None and channels.keys() >= {n, *s.source}
     }
     if not by_difference:
         return []

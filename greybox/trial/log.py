@@ -9,13 +9,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS, MOTIONS
 from greybox.errors import LogError, UsageError
 from greybox.notebook import DisplayMixin, items, number, sparkline, table
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.gaps import bridge
+from greybox.trial.raw_log import Array, Mask
 from greybox.trial.steps import Step
 from greybox.vessel.actuation import actuated_force
 from greybox.vessel.conditions import Conditions
@@ -24,8 +24,6 @@ from greybox.vessel.vessel import Vessel
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
-
-Array = NDArray[np.float64]
 
 # what a record says of itself, beside a file or within a frame
 RECORD_FORMAT = "greybox-log"
@@ -130,10 +128,10 @@ class TrialLog(DisplayMixin):
     t: Array
     channels: Mapping[str, Array]
     vessel: Vessel
-    closed_loop: NDArray[np.bool_]
+    closed_loop: Mask
     loop_known: bool = False
     provenance: Provenance = field(default_factory=Provenance)
-    missing: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    missing: Mapping[str, Mask] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.t)
@@ -193,7 +191,7 @@ class TrialLog(DisplayMixin):
         head = ("channel", "unit", "least", "mean", "most", "over time")
         return table(head, self._rows()), items("History", self._history())
 
-    def known(self, names: Iterable[str]) -> NDArray[np.bool_]:
+    def known(self, names: Iterable[str]) -> Mask:
         """Return which samples hold measured values of all the named channels, (N,)."""
         out = np.ones(len(self), bool)
         for name in names:
@@ -378,8 +376,10 @@ def make_log(
         arrays.setdefault("t", np.asarray(index, float))
     lengths = {k: len(v) for k, v in arrays.items()}
     if len(set(lengths.values())) > 1:
-        (a, na), (b, nb) = min(lengths.items(), key=_second), max(lengths.items(), key=_second)
-        raise LogError(f"'{a}' has {na} samples and '{b}' has {nb}: give arrays of one length.")
+        a, b = min(lengths, key=lengths.__getitem__), max(lengths, key=lengths.__getitem__)
+        raise LogError(
+            f"'{a}' has {lengths[a]} samples and '{b}' has {lengths[b]}: give arrays of one length."
+        )
     missing = {
         k: np.isnan(v) for k, v in arrays.items() if k in MOTIONS and np.isnan(v[1:-1]).any()
     }
@@ -419,7 +419,3 @@ def require_xarray() -> Any:
 def _range(a: Array) -> tuple[float | None, float | None, float | None]:
     """Return least, mean and largest value, None where there are no samples."""
     return (float(a.min()), float(a.mean()), float(a.max())) if len(a) else (None, None, None)
-
-
-def _second(item: tuple[str, int]) -> int:
-    return item[1]

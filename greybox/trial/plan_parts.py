@@ -16,10 +16,10 @@ from greybox.errors import LogError
 from greybox.files import read_csv_rows
 from greybox.trial.convert.time_grid import MIN_SEGMENT
 from greybox.trial.log import TrialLog
+from greybox.trial.raw_log import Array
 from greybox.trial.segments import join_segments, whole_name
 from greybox.vessel.vessel import Vessel
 
-Array = NDArray[np.float64]
 Samples = NDArray[np.intp]
 
 LEAD_IN, TRIAL, CROSSING, VALIDATION = "lead-in", "trial", "crossing", "validation"

@@ -18,6 +18,7 @@ from greybox.trial.steps import Step, on_zero
 from greybox.vessel.conditions import Conditions
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, repr=False)
@@ -54,7 +55,7 @@ class Signal:
         return f"<Signal: {self.name} [{self.unit or 'no unit'}], {len(self)} values>"
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Mask:
         """Which samples have a time and a value that are numbers, (N,)."""
         return np.isfinite(self.t) & np.isfinite(self.value)
 

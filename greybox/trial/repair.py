@@ -13,11 +13,9 @@ from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import IDS, CheckReport, Finding
 from greybox.trial.checks.signal_quality import clean
 from greybox.trial.convert.derived_signals import derive_signals
-from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.raw_log import Array, Recording, Signal
 from greybox.trial.steps import Step, mend
 from greybox.trial.time_format import unpadded_numbers
-
-Array = NDArray[np.float64]
 
 # a velocity is a difference, and its noise another one
 _LEAST_SAMPLES = 3

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.trial.gaps import runs, split_at_gaps
 from greybox.trial.log import Logs, TrialLog, as_list
-
-Array = NDArray[np.float64]
+from greybox.trial.raw_log import Array
 
 # what the name of a segment has behind that of its log
 _SEGMENT = re.compile(r"\[\d+\]$")

@@ -11,12 +11,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.rotation import ned_to_body
-
-Array = NDArray[np.float64]
+from greybox.trial.raw_log import Array
 
 
 def savgol_velocities(

@@ -17,6 +17,8 @@ RECORDED = "recorded"
 _LONGEST = 1000
 # no time, angle or length in SI is larger, and sums and ratios of such numbers are finite
 _LARGEST = 1e30
+# seconds since 1970 that a date can have: the year 5138
+LATEST_DATE = 1e11
 _OF_MOTION = frozenset({"difference", "local_polynomials", "earth_to_body"})
 
 

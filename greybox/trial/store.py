@@ -20,12 +20,10 @@ from greybox.trial.gaps import joined_spans
 from greybox.trial.log import RECORD_FORMAT, RECORD_VERSION, Provenance, TrialLog
 from greybox.trial.old_records import steps_of_sentences
 from greybox.trial.readers.limits import limits
-from greybox.trial.steps import Step, step_from_dict
+from greybox.trial.steps import LATEST_DATE, Step, step_from_dict
 from greybox.vessel.conditions import Conditions
 
 _ROWS = 1 << 17
-# seconds since 1970 that a date can have: the year 5138
-_LATEST = 1e11
 
 
 def record_path(path: str | Path) -> Path:
@@ -190,7 +188,7 @@ def recorded_provenance(record: Mapping[str, Any]) -> Provenance:
             if isinstance(f, list) and len(f) == 3
         ),
         words("read"),
-        float(epoch) if isinstance(epoch, int | float) and abs(epoch) < _LATEST else None,
+        float(epoch) if isinstance(epoch, int | float) and abs(epoch) < LATEST_DATE else None,
         {str(k): str(v) for k, v in notes.items()} if isinstance(notes, dict) else {},
         Conditions.recorded(record),
         recorded_actuators(record),

@@ -54,6 +54,9 @@ class Unpadded:
         return len(self.rows)
 
 
+_NOTHING = Unpadded(np.empty(0, np.int64), np.empty(0))
+
+
 def unpadded_text(
     t: Array, digits: Array, length: Rows, zero_ends: NDArray[np.bool_], width: int
 ) -> Unpadded:
@@ -80,9 +83,8 @@ def unpadded_text(
     t, digits, length, zero_ends = t[finite], digits[finite], length[finite], zero_ends[finite]
     # the first digit of a fraction that lost its zeros is none
     short = (length > 0) & (length < width) & (digits * 10.0 ** (1 - length) >= 1)
-    nothing = Unpadded(np.empty(0, np.int64), np.empty(0))
     if not short.any() or len(t) < 2:
-        return nothing
+        return _NOTHING
     full = length == width
     keeps_zeros = bool((full & zero_ends).any() or (short & zero_ends).any())
     means = np.where(short, t - digits * 10.0**-length + digits * 10.0**-width, t)
@@ -97,7 +99,7 @@ def unpadded_text(
 
     written, meant = np.diff(t), np.diff(means)
     back = per_run((written < 0).astype(float)), per_run((meant < 0).astype(float))
-    uneven = per_run(_off(written, usual)), per_run(_off(meant, usual))
+    uneven = per_run(np.abs(written - usual)), per_run(np.abs(meant - usual))
     if keeps_zeros:
         good = (back[1] < back[0]) | ((back[1] == back[0]) & (uneven[1] < _BETTER * uneven[0]))
     else:
@@ -106,13 +108,9 @@ def unpadded_text(
     lost = short & good[run]
     if not keeps_zeros and lost.sum() < 0.5 * short.sum():
         # the other short fractions are as they should be: zeros at the end are left out
-        return nothing
+        return _NOTHING
     rows = np.flatnonzero(lost)
     return Unpadded(finite[rows], means[rows])
-
-
-def _off(steps: Array, usual: float) -> Array:
-    return np.asarray(np.abs(steps - usual), float)
 
 
 def unpadded_numbers(t: Array) -> Unpadded:
@@ -128,16 +126,15 @@ def unpadded_numbers(t: Array) -> Unpadded:
     """
     finite = np.flatnonzero(np.isfinite(t))
     x = t[finite]
-    nothing = Unpadded(np.empty(0, np.int64), np.empty(0))
     if len(x) < 4:
-        return nothing
+        return _NOTHING
     second = np.floor(x + 1e-7)
     edges = np.flatnonzero(np.diff(second) != 0) + 1
     starts, stops = np.concatenate([[0], edges]), np.concatenate([edges, [len(x)]])
     steps = np.diff(x)
     usual = float(np.median(np.abs(steps)))
     if not 0 < usual < 10:
-        return nothing
+        return _NOTHING
     falls = np.flatnonzero((steps < 0) & (second[1:] == second[:-1]))
     group = np.searchsorted(starts, falls, side="right") - 1
     # the last fall of each second
@@ -164,7 +161,7 @@ def unpadded_numbers(t: Array) -> Unpadded:
     repaired[rows] = means
     if back and int((np.diff(repaired) < 0).sum()) > 0.5 * back:
         # rows out of order explain what this does not
-        return nothing
+        return _NOTHING
     return Unpadded(finite[rows], np.array(means, float))
 
 
@@ -211,8 +208,7 @@ def _out_of_step(x: Array, starts: Rows, stops: Rows, usual: float, grid: int | 
     most = float(elsewhere.max(initial=0.0))
     short = np.zeros(len(x), bool)
     if grid is not None:
-        scaled = x * 10.0 ** (grid - 1)
-        short = np.abs(scaled - np.round(scaled)) < 1e-6 + np.abs(scaled) * 1e-15
+        short = _whole(x * 10.0 ** (grid - 1))
     # what lost a zero has a digit less than the others
     times = 2 * _OUTLYING if grid is None else _OUTLYING
     far = whole & (off > max(times * most, 0.25 * usual)) & (short | (grid is None))
@@ -223,10 +219,14 @@ def _out_of_step(x: Array, starts: Rows, stops: Rows, usual: float, grid: int | 
 def _decimals(x: Array) -> int | None:
     """Return with how many decimals times are written, None where there are too many to tell."""
     for count in range(_MOST_DECIMALS + 1):
-        scaled = x * 10.0**count
-        if np.mean(np.abs(scaled - np.round(scaled)) < 1e-6 + np.abs(scaled) * 1e-15) > 0.95:
+        if np.mean(_whole(x * 10.0**count)) > 0.95:
             return count
     return None
+
+
+def _whole(x: Array) -> NDArray[np.bool_]:
+    """Whether numbers are whole, but for the rounding of doubles."""
+    return np.asarray(np.abs(x - np.round(x)) < 1e-6 + np.abs(x) * 1e-15)
 
 
 def _chain(
@@ -251,8 +251,7 @@ def _chain(
         options = whole + part * places
         fits = (options > low + 1e-9) & (options < high - 1e-9) & (options < whole + 0.1 + 1e-9)
         if grid is not None:
-            scaled = options * 10.0**grid
-            fits &= np.abs(scaled - np.round(scaled)) < 1e-6 + np.abs(scaled) * 1e-15
+            fits &= _whole(options * 10.0**grid)
             fits &= part * places * 10.0**grid >= 0.5 * (part > 1e-9)
         if not fits.any():
             return None

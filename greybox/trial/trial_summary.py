@@ -53,7 +53,7 @@ class Contents(DisplayMixin):
         if self.regimes and self.seconds > 0:
             said = ", ".join(
                 f"{name} {100 * s / self.seconds:.0f} %"
-                for name, s in sorted(self.regimes.items(), key=_longest)
+                for name, s in sorted(self.regimes.items(), key=lambda item: -item[1])
             )
             parts.append(f"sign regimes kept for {_SHORTEST:g} s or more: {said}")
         return "\n".join(parts)
@@ -68,10 +68,6 @@ class Contents(DisplayMixin):
             "manoeuvres": [manoeuvre_to_dict(m) for m in self.manoeuvres],
             "regimes": dict(self.regimes or {}),
         }
-
-
-def _longest(item: tuple[str, float]) -> float:
-    return -item[1]
 
 
 def describe_logs(segments: Sequence[TrialLog]) -> Contents:

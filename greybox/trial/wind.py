@@ -10,12 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.rotation import body_to_ned
-
-Array = NDArray[np.float64]
+from greybox.trial.raw_log import Array
 
 # of the power law over water in a neutral atmosphere
 _EXPONENT = 1 / 7

@@ -19,7 +19,6 @@ from math import pi
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.numerics.lagged_moments import bartlett_sums, lag_one_correlation
 from greybox.numerics.recursion import propagate
@@ -27,10 +26,8 @@ from greybox.numerics.robust import HUBER, huber_loss, huber_weights, robust_dev
 from greybox.trial.actuator_estimate import ActuatorEstimate, Measured
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import orderly
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Mask, Recording
 from greybox.vessel.vessel import Actuator, ActuatorKind, Vessel
-
-Array = NDArray[np.float64]
 
 # delays that are looked for [s]; a negative one is a command whose clock is late
 _EARLIEST, _LATEST = -1.0, 6.0
@@ -139,7 +136,7 @@ class _Pair:
         held = self.command[np.clip(np.searchsorted(self.moved, self.t, "right") - 1, 0, None)]
         return np.asarray(2 * pi * np.round((self.y - held) / (2 * pi)))
 
-    def rows(self, keep: NDArray[np.bool_]) -> _Pair:
+    def rows(self, keep: Mask) -> _Pair:
         """Return the pair with some samples of the feedback only."""
         return replace(self, t=self.t[keep], y=self.y[keep])
 

@@ -10,11 +10,9 @@ from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, Outcome
 from greybox.trial.checks.motion import make_motion, smooth
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Recording
 from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 # a hull that goes ahead drifts by less than this; thrusters that push sideways may do more
 PLAUSIBLE = np.radians(20)
@@ -109,13 +107,17 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
         Canonical, with positions or velocities over ground, and heading.
     vessel : Vessel
     """
+
+    def untold(why: str) -> tuple[list[Finding], list[Outcome]]:
+        return [], [Outcome("heading_bias", "cannot tell", why)]
+
     vague = "the log has no velocity sensor of its own, only course and heading"
     course = make_course(recording)
     if course is None:
-        return [], [Outcome("heading_bias", "cannot tell", "needs positions and heading")]
+        return untold("needs positions and heading")
     psi, track = course.psi, course.track
     if not len(psi):
-        return [], [Outcome("heading_bias", "cannot tell", f"{vague}, and it hardly moves")]
+        return untold(f"{vague}, and it hardly moves")
     unit = course.drift(psi)
     mean = complex(unit.mean())
     angle = float(np.angle(mean))
@@ -123,11 +125,9 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
     sentence = f"{vague}: a bias cannot be told from a drift angle of {np.degrees(angle):.0f} deg"
     astern = abs(abs(angle) - np.pi) < PLAUSIBLE
     if abs(mean) < _LEAST_SHARE or abs(angle) < PLAUSIBLE or astern or spread < _LEAST_TURN:
-        return [], [Outcome("heading_bias", "cannot tell", sentence)]
+        return untold(sentence)
     if _pushed(recording, vessel, angle):
-        return [], [
-            Outcome("heading_bias", "cannot tell", f"{sentence}, and the thrusters push that way")
-        ]
+        return untold(f"{sentence}, and the thrusters push that way")
     # a current beside the body-fixed direction, and the drift of a turning hull: all are fitted
     bow = np.exp(1j * psi)
     design = np.column_stack([bow, np.ones(len(psi)), 1j * course.turning * bow])
@@ -137,11 +137,10 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
     apart = np.angle(np.exp(1j * (np.array(left) - bias)))
     error = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum((apart - apart.mean()) ** 2)))
     if abs(bias) - 1.96 * error < PLAUSIBLE:
-        told = (
+        return untold(
             f"{vague}: beside a current and the drift of turning, the course lies "
             f"{np.degrees(-bias):.0f} +/- {np.degrees(1.96 * error):.0f} deg off the heading"
         )
-        return [], [Outcome("heading_bias", "cannot tell", told)]
     # what a drifting hull may add is unknown: the interval allows for a plausible drift angle
     half = float(np.hypot(1.96 * error, PLAUSIBLE / 2))
     finding = Finding(

@@ -33,16 +33,21 @@ from greybox.numerics.recursion import decay
 from greybox.numerics.robust import robust_deviation
 from greybox.rotation import ned_to_body
 from greybox.trial.checks.finding import Finding, Outcome
-from greybox.trial.checks.motion import Motion, denoise, make_motion, orderly, slope
+from greybox.trial.checks.motion import (
+    Motion,
+    denoise,
+    make_motion,
+    means_between,
+    orderly,
+    slope,
+)
 from greybox.trial.convert.resample import clock as make_clock
 from greybox.trial.convert.resample import hold_mean
 from greybox.trial.gaps import runs
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Mask, Recording
 from greybox.trial.steps import Step
 from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 _STATES = ("u", "v")
 _EARTH = ("v_n", "v_e")
@@ -215,9 +220,7 @@ def _mean_after(value: Array, motion: Motion) -> Array:
     """Return means over the sample that follows each time, by the cubic through four samples."""
     mean = value.copy()
     for a, b in motion.stretches:
-        x = value[a:b]
-        mean[a : b - 1] = 0.5 * (x[:-1] + x[1:])
-        mean[a + 1 : b - 2] = (13 * (x[1:-2] + x[2:-1]) - x[:-3] - x[3:]) / 24
+        mean[a : b - 1] = means_between(value[a:b])
     return mean
 
 
@@ -317,7 +320,7 @@ class _Log:
     thrust: Array
     motion: Array
 
-    def of(self, s: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def of(self, s: int) -> tuple[NDArray[np.int64], Mask]:
         """Return the kinds of terms (p,) in surge or sway, and which are of this log alone."""
         swapped = np.array([_ASKEW, _SHIP, *range(_FINE, _FREE + 1)])
         kind = swapped[self.kind] if s else self.kind

@@ -21,10 +21,10 @@ from greybox.trial.checks.finding import Finding, Outcome, declare_unit, exact_f
 from greybox.trial.checks.motion import Motion, integrate, profiles, read_together, to_ned
 from greybox.trial.checks.wind_convention import STEADIER
 from greybox.trial.convert.derived_signals import continuous
+from greybox.trial.raw_log import Array
 from greybox.trial.steps import Step, mend
 from greybox.units import UNITS
 
-Array = NDArray[np.float64]
 Values = dict[str, Array]
 
 # what one more change must gain in log-likelihood, and in share of the residual

@@ -9,10 +9,8 @@ from greybox.numerics.robust import robust_deviation
 from greybox.trial.checks.finding import Finding, exact_finding
 from greybox.trial.checks.signal_quality import quantum
 from greybox.trial.convert.derived_signals import usual_reach
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Recording
 from greybox.trial.steps import mend
-
-Array = NDArray[np.float64]
 
 # a sample between the two sides does harm from here on [rad]
 _LEAST = np.radians(1.0)

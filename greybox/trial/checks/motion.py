@@ -23,9 +23,8 @@ from greybox.numerics.robust import robust_deviation
 from greybox.rotation import body_to_ned
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock, stretches
-from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.raw_log import Array, Recording, Signal
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 Key = TypeVar("Key")
 
@@ -193,14 +192,17 @@ def integrate(rate: Array, motion: Motion) -> Array:
     between samples is not cut short.
     """
     out = np.zeros_like(rate)
-    h = motion.step
     for a, b in motion.stretches:
-        f = rate[a:b]
-        steps = 0.5 * (f[1:] + f[:-1])
-        if len(f) > 3:
-            steps[1:-1] = (13 * (f[1:-2] + f[2:-1]) - f[:-3] - f[3:]) / 24
-        out[a + 1 : b] = h * np.cumsum(steps, axis=0)
+        out[a + 1 : b] = motion.step * np.cumsum(means_between(rate[a:b]), axis=0)
     return out
+
+
+def means_between(value: Array) -> Array:
+    """Return means between neighbours along axis 0, by the cubic through four samples."""
+    means = 0.5 * (value[1:] + value[:-1])
+    if len(value) > 3:
+        means[1:-1] = (13 * (value[1:-2] + value[2:-1]) - value[:-3] - value[3:]) / 24
+    return np.asarray(means)
 
 
 def slope(value: Array, motion: Motion) -> Array:

@@ -16,10 +16,9 @@ from greybox.trial.checks.signal_quality import (
     significant_digits,
 )
 from greybox.trial.gaps import HOLE, usual_step
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Mask, Recording
 from greybox.trial.steps import mend
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 # standard errors by which the ship must have moved around a held position
@@ -175,9 +174,7 @@ def _held(track: Track) -> tuple[Rows, tuple[int, int], float] | None:
     return rows, (int(first[k] + usual), int(extra[k])), float(missed[k])
 
 
-def _speed(
-    at: Array, there: Array, t: Array, p: Array, period: float
-) -> tuple[Array, NDArray[np.bool_]]:
+def _speed(at: Array, there: Array, t: Array, p: Array, period: float) -> tuple[Array, Mask]:
     """Return the speed [m/s] around some samples, and whether it is more than noise."""
     half = max(_AROUND, _AROUND_SAMPLES * period)
     a = np.searchsorted(t, at - half)
@@ -193,9 +190,7 @@ def _speed(
     return way / np.maximum(time, period), way > _UNDER_WAY * np.sqrt(2) * noise
 
 
-def _own_rate(
-    late: NDArray[np.bool_], length: Rows, usual: int, first: Rows, p: Array, way: Array
-) -> bool:
+def _own_rate(late: Mask, length: Rows, usual: int, first: Rows, p: Array, way: Array) -> bool:
     """Whether positions repeat evenly and none is followed by a longer step."""
     chosen = np.flatnonzero(late)
     apart = np.diff(chosen)

@@ -15,15 +15,12 @@ from greybox.numerics.robust import FROM_MEDIAN
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import Finding
 from greybox.trial.checks.position_hold import Track, position_track
-from greybox.trial.checks.signal_quality import clean
+from greybox.trial.checks.signal_quality import sampled
 from greybox.trial.gaps import HOLE, usual_step
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Mask, Recording
 from greybox.trial.steps import mend
 from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # samples on both sides of a jump that may say what it should have been
 _BESIDE = (4, 6, 9, 13, 20, 30)
@@ -150,7 +147,7 @@ def _jumps(track: Track, recording: Recording, vessel: Vessel | None) -> list[_J
     way = np.diff(p, axis=0)
     speed = _median(way / dt[:, None])
     middle = 0.5 * (t[1:] + t[:-1])
-    psi = _heading(recording, middle)
+    psi = sampled(recording, "psi", middle)
     sailed = _velocity(recording, middle, psi)
     rest = None if sailed is None else np.where(whole[:, None], way - sailed * dt[:, None], 0.0)
     # as if every step took the usual time: what a longer or shorter one adds is known
@@ -168,7 +165,7 @@ def _jumps(track: Track, recording: Recording, vessel: Vessel | None) -> list[_J
     if psi is not None and vessel is not None and alone[-1] is not None:
         pushes = _pushes(recording, vessel, middle)
         alone += [_beside(alone[-1], pushes, whole, rounded)] if pushes is not None else []
-    ranked = sorted((v for v in alone if v is not None), key=_spread)
+    ranked = sorted((v for v in alone if v is not None), key=lambda view: view.spread)
     views = [(v, ranked[1:]) for v in ranked[:1]]
     if rest is not None:
         views += [(v, []) for v in [_view(rest, zero, whole, rounded)] if v is not None]
@@ -194,28 +191,15 @@ def _messages(track: Track) -> tuple[Array, Array]:
     return track.t[new], track.p[new]
 
 
-def _heading(recording: Recording, t: Array) -> Array | None:
-    """Return the heading [rad] at some times, None where the log has none."""
-    if "psi" not in recording:
-        return None
-    at, value = clean(recording["psi"])
-    return np.interp(t, at, value) if len(at) > 1 else None
-
-
 def _velocity(recording: Recording, t: Array, psi: Array | None) -> Array | None:
     """Return the velocity over ground at some times, (N, 2) [m/s]; None where it is not known."""
     pair = ("v_n", "v_e") if "v_n" in recording else ("u", "v")
-    if not all(n in recording for n in pair) or (pair == ("u", "v") and psi is None):
+    one, two = (sampled(recording, name, t) for name in pair)
+    if one is None or two is None:
         return None
-    values = []
-    for name in pair:
-        at, value = clean(recording[name])
-        if len(at) < 2:
-            return None
-        values.append(np.interp(t, at, value))
-    if psi is not None and pair == ("u", "v"):
-        return np.column_stack(body_to_ned(values[0], values[1], psi))
-    return np.column_stack(values)
+    if pair == ("v_n", "v_e"):
+        return np.column_stack([one, two])
+    return None if psi is None else np.column_stack(body_to_ned(one, two, psi))
 
 
 @dataclass(frozen=True)
@@ -275,16 +259,12 @@ class _View:
         return bool(np.argmax(gain) == 0)
 
 
-def _spread(view: _View) -> float:
-    return view.spread
-
-
 def _pushes(recording: Recording, vessel: Vessel, t: Array) -> Array | None:
     """Return the generalised forces and the yaw rate at some times, (N, q); None without them."""
-    signals = {c: clean(recording[c]) for c in (*vessel.commands, "r") if c in recording}
-    if len(signals) <= len(vessel.commands) or any(len(at) < 2 for at, _ in signals.values()):
+    found = {c: sampled(recording, c, t) for c in (*vessel.commands, "r")}
+    values = {c: value for c, value in found.items() if value is not None}
+    if len(values) < len(found):
         return None
-    values = {c: np.interp(t, at, value) for c, (at, value) in signals.items()}
     turning = values.pop("r")
     return np.column_stack([*generalised_force(vessel, values).values(), turning])
 

@@ -16,12 +16,10 @@ from greybox.trial.convert.deduplicate import CUT_RUNS, second_run
 from greybox.trial.convert.derived_signals import continuous
 from greybox.trial.convert.resample import clock
 from greybox.trial.gaps import GAP, HOLE, runs, usual_step
-from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.raw_log import Array, Mask, Recording, Signal
 from greybox.trial.steps import Step, mend
 from greybox.trial.time_format import unpadded_numbers
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 MOTION = ("x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "u_q", "v_q")
 
@@ -64,11 +62,8 @@ def time_findings(recording: Recording) -> list[Finding]:
         if repeated or back:
             count = repeated + back
             k = int(np.flatnonzero(steps <= 0)[0])
-            what = (
-                [f"{repeated} repeat{'' if repeated > 1 else 's'} the one before"]
-                if repeated
-                else []
-            )
+            once = f"{repeated} repeat{'' if repeated > 1 else 's'} the one before"
+            what = [once] if repeated else []
             what += [f"{back} go{'' if back > 1 else 'es'} back"] if back else []
             second = second_run(finite)
             if second is None:
@@ -180,7 +175,7 @@ def missing_findings(recording: Recording) -> list[Finding]:
     return found
 
 
-def _own_rate(bad: NDArray[np.bool_]) -> bool:
+def _own_rate(bad: Mask) -> bool:
     """Whether the holes are those of a slow sensor in a fast table: most rows, evenly."""
     good = np.flatnonzero(~bad)
     if len(good) < 5 or bad.mean() < 0.4:
@@ -308,13 +303,9 @@ def _comes_back(value: Array, a: int, b: int) -> bool:
         return False
     # a steady course is a slope: what counts is what stands out of it
     slope, level = np.polyfit(rows - a, value[rows], 1)
-    flat = (
-        value[max(a - 3, 0) : b + 3]
-        - slope * (np.arange(max(a - 3, 0) - a, b + 3 - a))[: len(value[max(a - 3, 0) : b + 3])]
-        - level
-    )
-    first = a - max(a - 3, 0)
-    before, part, after = flat[:first], flat[first : first + b - a], flat[first + b - a :]
+    near = np.arange(max(a - 3, 0), min(b + 3, len(value)))
+    flat = value[near] - slope * (near - a) - level
+    before, part, after = np.split(flat, [a - near[0], b - near[0]])
     beside = np.concatenate([before, after])
     excess = float(max((part - beside.max()).max(), (beside.min() - part).max()))
     steps = max(float(np.abs(np.diff(side)).max()) for side in (before, after) if len(side) > 1)
@@ -561,6 +552,14 @@ def clean(s: Signal) -> tuple[Array, Array]:
     if s.name == "psi":
         value = continuous(value)
     return t, value
+
+
+def sampled(recording: Recording, name: str, t: Array) -> Array | None:
+    """Return a channel at some times, straight between its samples; None where it has no two."""
+    if name not in recording:
+        return None
+    at, value = clean(recording[name])
+    return np.interp(t, at, value) if len(at) > 1 else None
 
 
 def clocks(recording: Recording) -> list[tuple[tuple[str, ...], Array]]:

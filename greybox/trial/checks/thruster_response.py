@@ -23,6 +23,7 @@ from greybox.trial.checks.motion import (
     integrate,
     integrated_damping,
     make_motion,
+    orderly,
     profile,
     read_together,
     slope,
@@ -33,12 +34,10 @@ from greybox.trial.checks.motion import (
 from greybox.trial.convert.resample import clock as make_clock
 from greybox.trial.convert.resample import hold
 from greybox.trial.gaps import runs
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Recording
 from greybox.trial.steps import Step, mend
 from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 # what an alternative must gain in log-likelihood, and how much more than the columns as they are
 _LEAST_GAIN = 20.0
@@ -274,10 +273,8 @@ def _picture(
 
 
 def _held(recording: Recording, name: str, t: Array) -> Array:
-    s = recording[name]
-    keep = s.known
-    order = np.argsort(s.t[keep], kind="stable")
-    return hold(make_clock(s.t[keep][order]), s.value[keep][order], t)
+    s = orderly(recording[name], angular=False)
+    return hold(make_clock(s.t), s.value, t)
 
 
 def _open_loop(

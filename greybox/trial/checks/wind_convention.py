@@ -6,14 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.trial.checks.finding import Finding, exact_finding, factor_of
 from greybox.trial.checks.motion import make_motion, smooth, to_ned
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Recording
 from greybox.trial.steps import Step, mend
-
-Array = NDArray[np.float64]
 
 # what does not turn with the ship must become this much steadier under another convention
 STEADIER = 3.0

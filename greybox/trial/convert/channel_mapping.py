@@ -20,7 +20,7 @@ from greybox.trial.convert.merge import merge, on_one_clock
 from greybox.trial.convert.settle_axes import settle_axes
 from greybox.trial.convert.time_scale import TimeScale, time_scale
 from greybox.trial.log import Provenance
-from greybox.trial.raw_log import Recording, Signal, SourceFile, shortened
+from greybox.trial.raw_log import Array, Recording, Signal, SourceFile, shortened
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
 from greybox.trial.readers.topic_files import STAMP, TopicTable
@@ -28,8 +28,6 @@ from greybox.trial.steps import Step, on_zero
 from greybox.trial.store import read_record, recorded_provenance
 from greybox.units import unit_factor
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 MOTION = frozenset({"x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "lat", "lon", "sog"})
 
@@ -258,11 +256,10 @@ def table_columns(
 
 def without_false_positions(assigned: dict[str, Assigned], batch: Batch) -> dict[str, Assigned]:
     """Leave out columns ``n`` and ``e`` whose values do not change as positions do."""
-    if not is_short_pair(assigned):
+    moves = (_moves_like_a_position(batch[assigned[n].raw]) for n in _PLACE if n in assigned)
+    if not is_short_pair(assigned) or all(moves):
         return assigned
-    if all(_moves_like_a_position(batch[assigned[n].raw]) for n in ("x_n", "y_n")):
-        return assigned
-    return {n: a for n, a in assigned.items() if n not in ("x_n", "y_n")}
+    return {n: a for n, a in assigned.items() if n not in _PLACE}
 
 
 def _moves_like_a_position(value: NDArray[Any]) -> bool:
@@ -282,10 +279,6 @@ def _moves_like_a_position(value: NDArray[Any]) -> bool:
 def _parts(table: TableFile) -> dict[str, tuple[str, ...]]:
     """Return the columns of the file behind each column that is made of others."""
     return table.parts if isinstance(table, TopicTable) else {}
-
-
-def _listed(columns: Sequence[str]) -> str:
-    return ", ".join(f"'{c}'" for c in columns)
 
 
 def possible(values: NDArray[Any]) -> NDArray[Any]:
@@ -320,9 +313,8 @@ def batch_recording(
         elif a.raw in table.text or a.raw in table.dates:
             notes.append(f"column '{a.raw}' holds words or dates, not numbers: left out")
         else:
-            source = (
-                f"column '{a.raw}'" if a.raw not in parts else f"columns {_listed(parts[a.raw])}"
-            )
+            made_of = ", ".join(f"'{c}'" for c in parts.get(a.raw, ()))
+            source = f"columns {made_of}" if made_of else f"column '{a.raw}'"
             signals.append(Signal(a.raw, t, possible(batch[a.raw]), a.unit, source))
     used = {a.raw for a in assigned.values()}
     used |= {c for made, of in parts.items() if made in used for c in of}

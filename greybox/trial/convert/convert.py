@@ -41,12 +41,10 @@ from greybox.trial.convert.time_grid import (
 )
 from greybox.trial.kinematics import carried_gaps
 from greybox.trial.log import Provenance, TrialLog
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Mask, Recording
 from greybox.trial.steps import Step, Value
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)
@@ -332,7 +330,7 @@ def _resample(
 
 def _loop(
     held: Mapping[str, tuple[Clock, NDArray[np.str_]]], vessel: Vessel, grid: Array
-) -> tuple[NDArray[np.bool_], bool]:
+) -> tuple[Mask, bool]:
     if vessel.closed_loop is None or vessel.closed_loop[0] not in held:
         return np.zeros(len(grid), bool), False
     of, words = held[vessel.closed_loop[0]]

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.gaps import usual_step
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Mask, Recording
 from greybox.trial.time_format import unpadded_numbers
-
-Array = NDArray[np.float64]
 
 # usual steps by which time may go back without there being two runs in a file
 _FAR = 50.0
@@ -64,7 +62,7 @@ def clean_signals(recording: Recording, origin: tuple[float, float] | None = Non
     return made.with_signals(signals, *notes)
 
 
-def _first_kept(t: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _first_kept(t: Array, keep: Mask) -> Mask:
     """Whether each is the first of those kept at its time, (N,)."""
     rows = np.flatnonzero(keep)
     first = np.zeros(len(t), bool)
@@ -116,24 +114,19 @@ def _order(
             if wrong
             else ""
         )
-        _refuse_two_runs(ordered, signal, name, cause)
+        if (second := second_run(ordered)) is not None:
+            k, twice = second
+            raise LogError(
+                f"time of {signal} in '{name}' goes back from {ordered[k - 1]:.6g} to "
+                f"{ordered[k]:.6g} s, over {twice:.4g} s that are there twice"
+                f"{cause or f': {CUT_RUNS}'}."
+            )
         notes.append(
             f"time of {signal} goes back {len(back)} time{'s' if len(back) > 1 else ''}, first "
             f"from {ordered[back[0]]:.6g} to {ordered[back[0] + 1]:.6g} s: put in order{cause}"
         )
         rows = rows[np.argsort(ordered, kind="stable")]
     return rows, t[rows]
-
-
-def _refuse_two_runs(t: Array, signal: str, name: str, cause: str) -> None:
-    """Refuse times that go back far, over times that are there already."""
-    found = second_run(t)
-    if found is not None:
-        k, twice = found
-        raise LogError(
-            f"time of {signal} in '{name}' goes back from {t[k - 1]:.6g} to {t[k]:.6g} s, over "
-            f"{twice:.4g} s that are there twice{cause or f': {CUT_RUNS}'}."
-        )
 
 
 def second_run(t: Array) -> tuple[int, float] | None:

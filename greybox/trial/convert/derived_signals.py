@@ -11,20 +11,17 @@ from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.channels import LOGGED
 from greybox.errors import LogError, suggestion
 from greybox.rotation import ned_to_body
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.kinematics import velocities_from_positions
-from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.raw_log import Array, Recording, Signal
 from greybox.trial.smoothing import savgol_velocities, smooth
 from greybox.trial.steps import Step
 from greybox.trial.wind import move_anemometer, relative_wind, wind_at_height
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 # speed and direction, and the components that may be interpolated
 _POLAR = (

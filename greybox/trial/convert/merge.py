@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.convert.derived_signals import wind_state
-from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.raw_log import Array, Recording, Signal
 from greybox.trial.readers.topic_files import QUARTER, zone_of
-from greybox.trial.steps import Step, new_steps, on_zero
+from greybox.trial.steps import LATEST_DATE, Step, new_steps, on_zero
 from greybox.vessel.conditions import Conditions
-
-Array = NDArray[np.float64]
 
 Span = tuple[float, float]
 
@@ -31,8 +29,6 @@ _OVERLAP = 0.05
 # the same where only another time zone lets them
 _ZONE_OVERLAP = 0.8
 _LARGEST_ZONE = 14 * 3600.0
-# seconds since 1970 that a date can have: the year 5138
-_LATEST = 1e11
 
 
 def merge(recordings: list[Recording]) -> Recording:
@@ -137,8 +133,7 @@ def _one_at_a_time(name: str, offered: list[_Part], notes: list[str]) -> list[_P
             raise LogError(
                 f"columns '{one}' of '{same.name}' and '{two}' of '{part.file.name}' hold values "
                 f"at the same times, and [columns] maps both to '{name}': remove one of the two "
-                f"lines "
-                f"from the vessel file."
+                f"lines from the vessel file."
             )
         notes.append(
             f"{name} stands in '{same.name}' and '{part.file.name}' at the same times: "
@@ -317,6 +312,6 @@ def _overlap(a: Span, b: Span) -> float:
 
 def _clock(time: float) -> str:
     """Return a UNIX time as a date, as a number where it is none that a calendar has."""
-    if not abs(time) < _LATEST:
+    if not abs(time) < LATEST_DATE:
         return f"{time:.6g} s"
     return datetime.fromtimestamp(time, UTC).strftime("%Y-%m-%d %H:%M:%S")

@@ -33,13 +33,11 @@ from greybox.trial.convert.time_grid import MIN_SEGMENT, Plan
 from greybox.trial.convert.time_scale import LATEST, time_scale
 from greybox.trial.gaps import split_at_gaps
 from greybox.trial.log import Provenance, TrialLog
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Recording
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
 from greybox.trial.segments import join_segments
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
 # share of a sample by which a time step may differ from the others
@@ -313,11 +311,6 @@ def _floats(batch: Batch, a: Assigned) -> Array:
     return np.asarray(values, float)
 
 
-def _importer(table: TableFile) -> str:
-    """Return what mends a table that is no clean log."""
-    return "recording_from_pandas" if table.format == "DataFrame" else "greybox import"
-
-
 def _require_uniform(
     t: Array,
     rows: NDArray[np.intp],
@@ -330,7 +323,8 @@ def _require_uniform(
     Times are those of some `rows` of the table, and `left_out` says why there are no more. That
     of the `whole` file is taken where the table is a part of one and agrees with it.
     """
-    name, importer = table.path.name, _importer(table)
+    name = table.path.name
+    importer = "recording_from_pandas" if table.format == "DataFrame" else "greybox import"
     if len(t) < MIN_SEGMENT:
         raise LogError(
             f"'{name}' has {len(t)} samples, at least {MIN_SEGMENT} are needed: use a longer log."

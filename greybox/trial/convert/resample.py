@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.gaps import HOLE, pieces, runs, usual_step
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from greybox.trial.raw_log import Array, Mask
 
 # low-pass of the signals that are faster than the log: cut-off as a share of its Nyquist rate
 _CUT_OFF = 0.8

@@ -12,17 +12,16 @@ from dataclasses import dataclass, field, replace
 from math import ceil, isclose
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.channels import MOTIONS
 from greybox.errors import LogError
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.kinematics import carried_gaps
 from greybox.trial.log import TrialLog
+from greybox.trial.raw_log import Array
 from greybox.trial.steps import Step, Value
 from greybox.vessel.vessel import Vessel
 
-Array = NDArray[np.float64]
 Arm = tuple[float, float]
 
 # keys that a finding made void which mended the same

@@ -11,16 +11,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.rotation import body_to_ned
 from greybox.trial.convert.derived_signals import continuous, derive_signals
-from greybox.trial.raw_log import Recording, Signal
-from greybox.trial.steps import Step
+from greybox.trial.raw_log import Array, Recording, Signal
+from greybox.trial.steps import DecidedBy, Step
 from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 _STEP = 0.2
 # over which displacements and changes of velocity are compared [s]
@@ -79,7 +76,7 @@ def _settle_velocity(recording: Recording) -> tuple[Recording, bool | None, Step
     left = _left_over(recording)
     axes, mirrored = _FLU, None
     reason = "no frame tells, and there are no positions to compare with"
-    decided = "default"
+    decided: DecidedBy = "default"
     if left:
         order = sorted(left, key=lambda k: left[k])
         # the other readings of the same axes are no rivals: the heading is settled apart
@@ -108,7 +105,7 @@ def _settle_velocity(recording: Recording) -> tuple[Recording, bool | None, Step
         (named[0].name, named[1].name),
         (u.source,),
         {"axes": axes},
-        decided_by="check" if decided == "check" else "default",
+        decided_by=decided,
         reason=reason,
     )
     # what another file states is better than what had to be found out
@@ -152,7 +149,7 @@ def _settle_heading(
     recording: Recording, vessel: Vessel, mirrored: bool | None
 ) -> tuple[Recording, Step]:
     """Return the recording with ψ read rightly: as of east-north-up, or of north-east-down."""
-    decided = "check"
+    decided: DecidedBy = "check"
     if mirrored is not None:
         reason = "no frame tells, and so the velocities agree with the positions"
     else:
@@ -164,7 +161,7 @@ def _settle_heading(
                 f"no frame tells, and so the thrusters explain the motion better (log-likelihood "
                 f"higher by {abs(gains[1] - gains[0]):.0f})"
             )
-        elif cosines is not None and _goes_ahead(cosines):
+        elif cosines and max(cosines) > _AHEAD and abs(cosines[1] - cosines[0]) > _AHEAD_GAIN:
             mirrored = cosines[1] > cosines[0]
             reason = (
                 f"no frame tells, and so the ship sails ahead (mean cosine between course and "
@@ -184,14 +181,10 @@ def _settle_heading(
         ("psi",),
         (psi.source,),
         {"axes": _NED if mirrored else _ENU},
-        decided_by="check" if decided == "check" else "default",
+        decided_by=decided,
         reason=reason,
     )
     return recording, step
-
-
-def _goes_ahead(cosines: tuple[float, float]) -> bool:
-    return max(cosines) > _AHEAD and abs(cosines[1] - cosines[0]) > _AHEAD_GAIN
 
 
 def _by_course(recording: Recording) -> tuple[float, float] | None:

@@ -7,19 +7,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.convert.derived_signals import POSITION_ORDER, made_from_positions
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.resample import Clock, covered, nice_period, resampled_by, stretches
 from greybox.trial.gaps import split_at_gaps
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Mask, Recording
 from greybox.trial.smoothing import window_samples
 from greybox.trial.steps import Step
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 _MOTION = ("x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e")
 _WIND = ("u_q", "v_q", "w_n", "w_e", "w_x", "w_y")
@@ -132,7 +129,7 @@ class Plan:
 
     def gaps(
         self, grid: Array, recording: Recording, clocks: Mapping[str, Clock]
-    ) -> dict[str, NDArray[np.bool_]]:
+    ) -> dict[str, Mask]:
         """Return the samples at which motions were not measured, of those that have such."""
         gaps = {}
         for s in recording.signals:
@@ -227,15 +224,11 @@ def _usable(
     motion = [n for n in _MOTION if n in used]
     inputs = [c for c in vessel.commands if c in used]
     if not motion and not inputs:
+        held = ", ".join(f"{n} ({e.count})" for n, e in extents.items())
         raise LogError(
             f"'{name}' has no position, heading, velocity or thruster column with "
-            f"{MIN_SEGMENT} values or more"
-            + (
-                f"; it has {', '.join(f'{n} ({e.count})' for n, e in extents.items())}"
-                if extents
-                else ""
-            )
-            + ". Map its columns in the vessel file, or use a longer log."
+            f"{MIN_SEGMENT} values or more{held and f'; it has {held}'}. Map its columns in the "
+            f"vessel file, or use a longer log."
         )
     missing = [c for c in vessel.commands if c not in used]
     if missing:
@@ -303,10 +296,10 @@ def gap_notes(spans: Sequence[tuple[float, float]], short: int, least: int) -> l
         )
     gaps = [(a[1], b[0]) for a, b in pairwise(spans)]
     if gaps:
-        longest = max(gaps, key=_length)
+        begin, end = max(gaps, key=lambda gap: gap[1] - gap[0])
         notes.append(
             f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''} kept as such, the longest of "
-            f"{_length(longest):.3g} s at t = {longest[0]:.6g} s: {len(spans)} segments"
+            f"{end - begin:.3g} s at t = {begin:.6g} s: {len(spans)} segments"
         )
     return notes
 
@@ -321,7 +314,3 @@ def too_short(plan: Plan) -> LogError:
         f"velocities are derived): choose another sample time{other}, or bridge longer "
         f"steps by greybox import --hole."
     )
-
-
-def _length(gap: tuple[float, float]) -> float:
-    return gap[1] - gap[0]

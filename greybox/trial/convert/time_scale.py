@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.convert.column_names import Assigned
+from greybox.trial.raw_log import Array
 from greybox.trial.readers.table import TableFile
 from greybox.trial.readers.topic_files import STAMP
 from greybox.units import is_unix_time, time_unit, unit_factor, unix_unit
-
-Array = NDArray[np.float64]
 
 _HEAD = 10_000
 # largest number of a time: those in UNIX nanoseconds are below 2e18

@@ -45,14 +45,12 @@ from greybox.trial.convert.time_grid import Extent, Plan, extent, gap_notes, pla
 from greybox.trial.convert.time_scale import TimeScale, time_scale
 from greybox.trial.gaps import joined_spans
 from greybox.trial.log import Provenance, TrialLog
-from greybox.trial.raw_log import Recording, Signal, SourceFile
+from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.trial.readers.topic_files import TopicTable
 from greybox.trial.steps import Step, new_steps
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 # tables that may hold more numbers are imported in blocks
 _LARGE_CELLS = 20_000_000
@@ -148,15 +146,9 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
             f"{found.repeated} row{'s' if found.repeated > 1 else ''} repeat a time: "
             f"the first is kept"
         )
+    said = (*notes, *plan.notes)
     return Scan(
-        decided,
-        found.scale,
-        found.origin,
-        found.back,
-        plan,
-        (*notes, *plan.notes),
-        steps,
-        before.conditions,
+        decided, found.scale, found.origin, found.back, plan, said, steps, before.conditions
     )
 
 

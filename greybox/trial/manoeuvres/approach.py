@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.manoeuvres.local import fit_at, regress
 from greybox.trial.manoeuvres.quantity import Quantity
 from greybox.trial.manoeuvres.track import Track
-
-Array = NDArray[np.float64]
+from greybox.trial.raw_log import Array
 
 _FEWEST = 5
 

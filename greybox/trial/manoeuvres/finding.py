@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.trial.gaps import runs
@@ -25,8 +25,8 @@ from greybox.trial.manoeuvres.stopping import Stopping, measure_stopping
 from greybox.trial.manoeuvres.track import without_antenna
 from greybox.trial.manoeuvres.turning_circle import TurningCircle, measure_turning_circle
 from greybox.trial.manoeuvres.zig_zag import ZigZag, measure_zigzag, without_angle
+from greybox.trial.raw_log import Array
 
-Array = NDArray[np.float64]
 Manoeuvre = TurningCircle | ZigZag | Stopping
 
 # least steering angle of a manoeuvre [rad]
@@ -68,6 +68,15 @@ class _Signals:
     @property
     def arrays(self) -> tuple[Array, Array | None, Array | None, Array, Array, Array]:
         return self.t, self.x_n, self.y_n, self.psi, self.u, self.v
+
+    @property
+    def known(self) -> dict[str, Any]:
+        """What is known of ship and sensors: arguments of every measurement."""
+        return {
+            "length": self.length,
+            "heading_std": self.heading_std,
+            "position_std": self.position_std,
+        }
 
     def rate(self, start: float, stop: float) -> float:
         """Return the mean yaw rate between two times [rad/s]."""
@@ -129,11 +138,7 @@ def find_manoeuvres(log: TrialLog, *, scale: float = 1.0) -> tuple[Manoeuvre, ..
     if steering is None:
         zigzags = list(_zigzags_by_speeds(log, signals, scale))
         found += zigzags
-        found += [
-            turn
-            for turn in _turns_by_yaw_rate(log, signals)
-            if not any(z.start < turn.stop and turn.start < z.stop for z in zigzags)
-        ]
+        found += _beside(_turns_by_yaw_rate(log, signals), zigzags)
     else:
         angle, greatest = steering
         opposed = sideways(log)
@@ -147,17 +152,14 @@ def find_manoeuvres(log: TrialLog, *, scale: float = 1.0) -> tuple[Manoeuvre, ..
         rudder = any(t.rudder is not None for t in log.vessel.thrusters)
         zigzags = list(_zigzags(signals, angle, held, scale, rudder))
         found += zigzags
-        found += [
-            turn
-            for turn in _turns(log, signals, angle, held, greatest, rudder)
-            if not any(z.start < turn.stop and turn.start < z.stop for z in zigzags)
-        ]
-    found += [
-        stop
-        for stop in _stops(log, signals)
-        if not any(m.start < stop.stop and stop.start < m.stop for m in found)
-    ]
+        found += _beside(_turns(log, signals, angle, held, greatest, rudder), zigzags)
+    found += _beside(_stops(log, signals), found)
     return tuple(sorted(_of_antenna(found, log), key=lambda m: m.start))
+
+
+def _beside(found: Iterable[Manoeuvre], others: Sequence[Manoeuvre]) -> list[Manoeuvre]:
+    """Return the manoeuvres that overlap with none of others."""
+    return [m for m in found if not any(o.start < m.stop and m.start < o.stop for o in others)]
 
 
 def _of_antenna(found: Sequence[Manoeuvre], log: TrialLog) -> Iterator[Manoeuvre]:
@@ -297,16 +299,19 @@ def _zigzag(
         *signals.arrays,
         executes=executes,
         rudder=level,
-        length=signals.length,
         stop=stop,
         scale=scale,
-        heading_std=signals.heading_std,
-        position_std=signals.position_std,
         start_std=signals.start_std,
+        **signals.known,
     )
     if rudder and made.direction * run[0].level < 0:
         made = replace(made, notes=(*made.notes, _WRONG_WAY))
     return made
+
+
+def _speeds(log: TrialLog) -> list[str]:
+    """Return the columns of propeller speeds that a log has, each once."""
+    return [n for n in dict.fromkeys(t.speed for t in log.vessel.thrusters) if n in log]
 
 
 def _thrust_kept(log: TrialLog, signals: _Signals, start: float) -> float:
@@ -314,9 +319,7 @@ def _thrust_kept(log: TrialLog, signals: _Signals, start: float) -> float:
     after = signals.t > start
     near = np.abs(signals.t - start) <= max(signals.ship_time / 2, 3 * signals.start_std)
     stop = float(signals.t[-1])
-    for name in dict.fromkeys(t.speed for t in log.vessel.thrusters):
-        if name not in log:
-            continue
+    for name in _speeds(log):
         usual = float(np.median(log[name][near]))
         off = np.flatnonzero(
             after & (np.abs(log[name] - usual) > _THRUST_VARIES * max(abs(usual), 1e-9))
@@ -358,13 +361,11 @@ def _turns(
         made = measure_turning_circle(
             *signals.arrays,
             start=start,
-            length=signals.length,
             stop=stop,
             rudder=order.level,
             full_rudder=greatest,
-            heading_std=signals.heading_std,
-            position_std=signals.position_std,
             start_std=signals.start_std,
+            **signals.known,
         )
         if rudder and made.direction * order.level < 0:
             made = replace(made, notes=(*made.notes, _WRONG_WAY))
@@ -416,11 +417,9 @@ def _one_turn(
     made = measure_turning_circle(
         *signals.arrays,
         start=start,
-        length=signals.length,
         stop=float(t[last]),
-        heading_std=signals.heading_std,
-        position_std=signals.position_std,
         start_std=start_std,
+        **signals.known,
     )
     if ordered is None:
         note = "no order is logged: the turn is taken to start where the yaw rate does"
@@ -431,11 +430,9 @@ def _one_turn(
 def _thrust_ordered(log: TrialLog, signals: _Signals, near: float, span: float) -> float | None:
     """Return when the last large change of a thruster command before a turn began [s]."""
     times = []
-    for name in dict.fromkeys(t.speed for t in log.vessel.thrusters):
-        if name not in log:
-            continue
+    for name in _speeds(log):
         value = log[name]
-        reach = float(value.max() - value.min())
+        reach = float(np.ptp(value))
         if reach <= 0:
             continue
         held = held_angles(
@@ -494,10 +491,8 @@ def _stops(log: TrialLog, signals: _Signals) -> Iterator[Stopping]:
         yield measure_stopping(
             *signals.arrays,
             start=start,
-            length=signals.length,
             stop=end,
             reversed_thrust=astern.level < -_THRUST_OFF * usual,
-            heading_std=signals.heading_std,
-            position_std=signals.position_std,
             start_std=signals.start_std,
+            **signals.known,
         )

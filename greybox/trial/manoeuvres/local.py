@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from greybox.numerics.robust import robust_deviation
+from greybox.trial.raw_log import Array
 
-Array = NDArray[np.float64]
 Side = Literal["both", "before", "after"]
 
 # half width of the first window, and its greatest, as shares of the time scale

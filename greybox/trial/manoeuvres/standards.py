@@ -8,6 +8,7 @@ IMO resolution MSC.137(76), Standards for ship manoeuvrability (2002), section 5
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -60,6 +61,19 @@ class Criterion:
         limit = f"{math.degrees(self.limit):.1f} deg" if angle else f"{self.limit:g} L"
         note = f" ({self.reason})" if self.reason else ""
         return f"{self.name}, at most {limit}: {self.verdict.value}{note}"
+
+
+def as_text(
+    head: str,
+    rows: Iterable[tuple[str, Quantity | None]],
+    length: float,
+    criteria: Iterable[Criterion],
+    notes: Iterable[str],
+) -> str:
+    """Return a manoeuvre as text: quantities that were measured, verdicts and notes."""
+    lines = [f"  {n:<20}{q.text(length)}" for n, q in rows if q is not None]
+    lines += [f"  IMO {c.summary()}" for c in criteria]
+    return "\n".join([head, *lines, *(f"  note: {n}" for n in notes)])
 
 
 def check_limit(name: str, measured: Quantity | None, limit: float, reason: str = "") -> Criterion:

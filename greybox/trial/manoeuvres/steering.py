@@ -7,14 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres.local import noise_std
+from greybox.trial.raw_log import Array, Mask
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 _TOLERANCE = math.radians(1.0)
 # angle between azimuth thrusters above which they push against one another [rad]
@@ -63,10 +61,9 @@ def steering_angle(log: TrialLog) -> tuple[Array, float | None] | None:
     vessel = log.vessel
     rudders = dict.fromkeys(t.rudder for t in vessel.thrusters if t.rudder is not None)
     if rudders and all(name in log for name in rudders):
-        limits = [
-            x for n in rudders if (x := _greatest(vessel.limits[n].lower, n, log)) is not None
-        ]
-        return np.mean([log[n] for n in rudders], axis=0), min(limits, default=None)
+        ends = [(vessel.limits[n].lower, vessel.limits[n].upper) for n in rudders]
+        greatest = [min(abs(a), abs(b)) for a, b in ends if a is not None and b is not None]
+        return np.mean([log[n] for n in rudders], axis=0), min(greatest, default=None)
     azimuths = _azimuths(vessel)
     if azimuths and all(name in log for name in azimuths):
         return np.mean(_deviations(log, azimuths), axis=0), None
@@ -97,7 +94,7 @@ def speed_difference(log: TrialLog) -> Array | None:
     return np.asarray(np.where(running, apart / np.where(running, total, 1.0), 0.0))
 
 
-def sideways(log: TrialLog) -> NDArray[np.bool_]:
+def sideways(log: TrialLog) -> Mask:
     """Return where azimuth thrusters push against one another.
 
     Their mean then is no steering angle: two at 45 degrees, one ahead and one
@@ -130,11 +127,6 @@ def _deviations(log: TrialLog, azimuths: Mapping[str, float]) -> list[Array]:
     """Return how far each azimuth (N,) is off straight, as a rudder would be [rad]."""
     # modulo half a turn: thrust straight astern is straight as well
     return [sign * ((log[n] + math.pi / 2) % math.pi - math.pi / 2) for n, sign in azimuths.items()]
-
-
-def _greatest(lower: float | None, name: str, log: TrialLog) -> float | None:
-    upper = log.vessel.limits[name].upper
-    return None if lower is None or upper is None else min(abs(lower), abs(upper))
 
 
 def held_angles(
@@ -172,7 +164,7 @@ def held_angles(
         if (
             before is not None
             and abs(before.level - level) <= 2 * tolerance
-            and (_stays(smooth[before.last : first + 1], level, 3 * tolerance))
+            and np.all(np.abs(smooth[before.last : first + 1] - level) <= 3 * tolerance)
         ):
             made[-1] = Held(before.level, before.first, last, before.execute)
         else:
@@ -192,10 +184,6 @@ def _reach(y: Array, i: int, span: float) -> int:
         if i + size >= len(y):
             return len(y) - 1
         size *= 2
-
-
-def _stays(y: Array, level: float, span: float) -> bool:
-    return bool(np.all(np.abs(y - level) <= span))
 
 
 def execute_time(t: Array, y: Array, first: int, level: float, tolerance: float) -> float:

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.notebook import DisplayMixin
 from greybox.rotation import ned_to_body
@@ -17,12 +16,12 @@ from greybox.trial.manoeuvres.standards import (
     TRACK_REACH_AT_MOST,
     TRACK_REACH_LENGTHS,
     Criterion,
+    as_text,
     check_limit,
     not_applicable,
 )
 from greybox.trial.manoeuvres.track import make_track, path_length
-
-Array = NDArray[np.float64]
+from greybox.trial.raw_log import Array
 
 
 @dataclass(frozen=True, repr=False)
@@ -92,11 +91,8 @@ class Stopping(DisplayMixin):
             ("time", self.time),
             ("heading change", self.heading_change),
         )
-        lines = [f"{self.label}, from {self.start:.1f} to {self.stop:.1f} s"]
-        lines += [f"  {n:<20}{q.text(self.length)}" for n, q in rows if q is not None]
-        lines += [f"  IMO {c.summary()}" for c in self.criteria]
-        lines += [f"  note: {n}" for n in self.notes]
-        return "\n".join(lines)
+        head = f"{self.label}, from {self.start:.1f} to {self.stop:.1f} s"
+        return as_text(head, rows, self.length, self.criteria, self.notes)
 
 
 def _unfinished(speed: float | None) -> str:

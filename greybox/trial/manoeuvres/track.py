@@ -6,13 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.rotation import body_to_ned
 from greybox.trial.manoeuvres.local import noise_std, regress
 from greybox.trial.manoeuvres.quantity import Quantity
-
-Array = NDArray[np.float64]
+from greybox.trial.raw_log import Array
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.notebook import DisplayMixin
@@ -18,12 +17,12 @@ from greybox.trial.manoeuvres.standards import (
     ADVANCE_LENGTHS,
     TACTICAL_LENGTHS,
     Criterion,
+    as_text,
     check_limit,
     not_applicable,
 )
 from greybox.trial.manoeuvres.track import Track, make_track
-
-Array = NDArray[np.float64]
+from greybox.trial.raw_log import Array
 
 # the standard's rudder angle, and how far an order may be from it
 _STANDARD, _TOLERANCE = math.radians(35), math.radians(2.5)
@@ -135,14 +134,11 @@ class TurningCircle(DisplayMixin):
             ("set to north", self.set_north),
             ("set to east", self.set_east),
         )
-        lines = [
+        head = (
             f"{self.label}, from {self.start:.1f} to {self.stop:.1f} s, "
             f"{math.degrees(self.heading_change):.0f} deg of heading"
-        ]
-        lines += [f"  {n:<20}{q.text(self.length)}" for n, q in rows if q is not None]
-        lines += [f"  IMO {c.summary()}" for c in self.criteria]
-        lines += [f"  note: {n}" for n in self.notes]
-        return "\n".join(lines)
+        )
+        return as_text(head, rows, self.length, self.criteria, self.notes)
 
 
 @dataclass(frozen=True)
@@ -234,13 +230,10 @@ def measure_turning_circle(
     half = crossing(t, own, math.pi, start, stop, scale, std=heading_std)
     frame = _frame(track, approach, start, scale, direction, start_std)
     full = crossing(t, own, 2 * math.pi, start, stop, scale, std=heading_std)
-    advance = transfer = tactical = time_90 = time_180 = time_360 = None
-    if quarter is not None:
-        advance, transfer, time_90 = _at(frame, approach, quarter, scale, start_std)
-    if half is not None:
-        _, tactical, time_180 = _at(frame, approach, half, scale, start_std)
-    if full is not None:
-        _, _, time_360 = _at(frame, approach, full, scale, start_std)
+    (advance, transfer, time_90), (_, tactical, time_180), (_, _, time_360) = (
+        (None, None, None) if found is None else _at(frame, approach, found, scale, start_std)
+        for found in (quarter, half, full)
+    )
     steady = _steady(t, psi, own, u, v, track, start, stop, heading_std)
     loss = None
     if steady is not None:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.notebook import DisplayMixin
@@ -18,6 +17,7 @@ from greybox.trial.manoeuvres.standards import (
     INITIAL_TURNING_LENGTHS,
     SHORTEST_SHIP,
     Criterion,
+    as_text,
     check_limit,
     first_overshoot_limit,
     first_overshoot_limit_20,
@@ -25,8 +25,7 @@ from greybox.trial.manoeuvres.standards import (
     second_overshoot_limit,
 )
 from greybox.trial.manoeuvres.track import make_track, path_length
-
-Array = NDArray[np.float64]
+from greybox.trial.raw_log import Array
 
 _TEN = math.radians(10)
 _FIVE = math.radians(5)
@@ -110,10 +109,7 @@ class ZigZag(DisplayMixin):
 
     def summary(self) -> str:
         """Return the measured values, verdicts and notes as text."""
-        lines = [
-            f"{self.label}, from {self.start:.1f} to {self.stop:.1f} s, "
-            f"{len(self.executes)} executes"
-        ]
+        where = f"from {self.start:.1f} to {self.stop:.1f} s, {len(self.executes)} executes"
         rows: list[tuple[str, Quantity | None]] = [("approach speed", self.approach_speed)]
         for i, (angle, time) in enumerate(zip(self.overshoots, self.check_times, strict=True)):
             rows += [(f"overshoot {i + 1}", angle), (f"  time to check {i + 1}", time)]
@@ -124,10 +120,7 @@ class ZigZag(DisplayMixin):
             ("reach", self.reach),
             ("period", self.period),
         ]
-        lines += [f"  {n:<20}{q.text(self.length)}" for n, q in rows if q is not None]
-        lines += [f"  IMO {c.summary()}" for c in self.criteria]
-        lines += [f"  note: {n}" for n in self.notes]
-        return "\n".join(lines)
+        return as_text(f"{self.label}, {where}", rows, self.length, self.criteria, self.notes)
 
 
 def measure_zigzag(
@@ -229,7 +222,8 @@ def measure_zigzag(
         slow = math.hypot(share * fit.std(when, 1) / abs(bend), start_std)
         checks.append(Quantity(when - time, slow, "s", fit.dof))
 
-    nominal = _nominal_rudder(rudder)
+    # the angle that was meant: a multiple of 5 degrees where one is near
+    nominal = _round(abs(rudder), _RUDDER_NEAR)
     reached = _nominal_heading([q.value for q in switch])
     heading = reached if heading is None else _round(abs(heading), _HEADING_NEAR)
     own = direction * (psi - psi0.value)
@@ -291,11 +285,6 @@ def without_angle(found: ZigZag) -> ZigZag:
     told = (not_applicable("overshoot", "no angle steers"),)
     notes = tuple(n for n in found.notes if not n.startswith("the standard is for ships"))
     return replace(found, rudder=None, criteria=told, notes=notes)
-
-
-def _nominal_rudder(rudder: float) -> float:
-    """Return the angle that was meant: a multiple of 5 degrees where one is near."""
-    return _round(abs(rudder), _RUDDER_NEAR)
 
 
 def _nominal_heading(switch: Sequence[float]) -> float:

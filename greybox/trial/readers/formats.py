@@ -35,13 +35,13 @@ _ROS_PACKAGES = {
     "ruamel": "ruamel.yaml",
 }  # fmt: skip
 _MAGIC = (
-    (b"PAR1", "parquet", "Parquet"),
-    (b"#ROSBAG", "ros", "a ROS bag"),
-    (b"\x89MCAP", "ros", "MCAP"),
-    (b"MATLAB 5.0 MAT-file", "mat", "a MATLAB file"),
-    (b"MATLAB 7.3 MAT-file", "mat", "a MATLAB file"),
-    (b"\x89HDF\r\n\x1a\n", "mat", "a MATLAB 7.3 file"),
-    (b"SQLite format 3", "ros", "a ROS 2 database"),
+    (b"PAR1", "parquet"),
+    (b"#ROSBAG", "ros"),
+    (b"\x89MCAP", "ros"),
+    (b"MATLAB 5.0 MAT-file", "mat"),
+    (b"MATLAB 7.3 MAT-file", "mat"),
+    (b"\x89HDF\r\n\x1a\n", "mat"),
+    (b"SQLite format 3", "ros"),
 )
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _REFUSED = (
@@ -159,7 +159,7 @@ def _kind(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix.lstrip(".") in {e.name for e in entry_points(group=GROUP)}:
         return suffix.lstrip(".")
-    for magic, kind, _ in _MAGIC:
+    for magic, kind in _MAGIC:
         if head.startswith(magic):
             return kind
     if head.startswith(_ZSTD) and {".db3", ".mcap"} & set(path.suffixes):

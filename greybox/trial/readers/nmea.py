@@ -22,11 +22,9 @@ from numpy.typing import NDArray
 
 from greybox.errors import LogError
 from greybox.files import sha256
-from greybox.trial.raw_log import Recording, Signal, SourceFile
+from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
 from greybox.trial.readers.limits import limits
 from greybox.units import UNITS
-
-Array = NDArray[np.float64]
 
 _DAY = 86400.0
 _SPEED_UNITS = {b"K": "km/h", b"N": "kn", b"M": "m/s", b"S": "mph"}
@@ -524,7 +522,8 @@ def _recording(path: Path, stream: _Stream, seen: _Seen) -> Recording:
         track = stream.tracks[name, sentence]
         at, order = np.array(track.tag), np.array(track.order)
         value = np.array(track.value)
-        if use_stamps and not (_timed(sentence) and len(tags)):
+        timed = sentence[2:] in ("GGA", "RMC", "GNS", "GLL") and len(tags)
+        if use_stamps and not timed:
             t = _at(stamps, order) - offset
             keep = np.isfinite(t)
         else:
@@ -566,10 +565,6 @@ def _median(values: Array) -> float:
     return float(np.median(finite)) if len(finite) else nan
 
 
-def _timed(sentence: str) -> bool:
-    return sentence[2:] in ("GGA", "RMC", "GNS", "GLL")
-
-
 def _choose(stream: _Stream, notes: list[str]) -> dict[str, str]:
     """Return for each quantity the sentence, talker included, to believe."""
     chosen: dict[str, str] = {}
@@ -579,13 +574,10 @@ def _choose(stream: _Stream, notes: list[str]) -> dict[str, str]:
         most = max(offers.values())
         rank = _PREFERRED.get(name, ())
 
-        def worth(sentence: str, rank: tuple[str, ...] = rank) -> tuple[int, str]:
-            kind = sentence[2:]
-            return (rank.index(kind) if kind in rank else len(rank), sentence)
-
         # a better kind with few sentences is worth less than one that covers the trial
         enough = [s for s, n in offers.items() if n >= 0.8 * most]
-        best = min(enough, key=lambda s: (worth(s)[0], -offers[s], s))
+        # by its place among those preferred, others last; then that which sent most
+        _, _, best = min(([*rank, s[2:]].index(s[2:]), -offers[s], s) for s in enough)
         chosen[name] = best
         others = [s for s in offers if s != best and s[2:] == best[2:]]
         if others:

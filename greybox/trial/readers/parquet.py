@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,6 @@ from greybox.trial.readers.table import Batch
 from greybox.trial.steps import Step
 
 _READ_BYTES = 1 << 20
-# damaged footers and pages surface as any of these, beside Arrow's own
-_ERRORS = (OSError, ValueError, KeyError, MemoryError, StopIteration, OverflowError)
 
 
 @dataclass
@@ -64,10 +63,9 @@ class ParquetFile:
         LogError
             A page is damaged, or a row group is larger than memory allows.
         """
-        import pyarrow as pa
         from pyarrow import parquet
 
-        try:
+        with _readable(self.path):
             # read in pieces: else whole row groups are held, however large they were written
             texts = [c for c in columns if c in self.text or c in self.parsed]
             # a long text that stands once in the file may stand in every row
@@ -83,10 +81,6 @@ class ParquetFile:
                     row_groups=self.groups,
                 ):
                     yield {c: column_values(batch.column(c), self.kind(c)) for c in columns}
-        except _ERRORS as error:
-            raise _unreadable(self.path, error) from None
-        except pa.ArrowException as error:
-            raise _unreadable(self.path, error) from None
 
     def kind(self, name: str) -> str:
         """Return what a column holds: text, parsed (dates written as text), date or number."""
@@ -141,16 +135,10 @@ def open_parquet(path: Path) -> ParquetFile:
     LogError
         The file is empty, truncated or no Parquet.
     """
-    import pyarrow as pa
     from pyarrow import parquet
 
-    try:
-        with parquet.ParquetFile(path, memory_map=False) as file:
-            schema, rows = file.schema_arrow, file.metadata.num_rows
-    except _ERRORS as error:
-        raise _unreadable(path, error) from None
-    except pa.ArrowException as error:
-        raise _unreadable(path, error) from None
+    with _readable(path), parquet.ParquetFile(path, memory_map=False) as file:
+        schema, rows = file.schema_arrow, file.metadata.num_rows
     size = path.stat().st_size
     if rows > max(limits().sure_rows, limits().rows_per_byte * size):
         raise LogError(
@@ -215,22 +203,19 @@ def column_kind(found: Any) -> str | None:
 
 def _written_dates(path: Path, text: Sequence[str]) -> frozenset[str]:
     """Return those columns of text whose first rows are dates."""
-    import pyarrow as pa
     from pyarrow import parquet
 
     if not text:
         return frozenset()
-    try:
-        with parquet.ParquetFile(
+    with (
+        _readable(path),
+        parquet.ParquetFile(
             path, memory_map=False, buffer_size=_READ_BYTES, read_dictionary=list(text)
-        ) as file:
-            _refuse_bombs(path, file.metadata, texts=True)
-            batch = next(file.iter_batches(batch_size=64, columns=list(text)))
-            first = {c: cell_text.text(batch.column(c)).tolist() for c in text}
-    except _ERRORS as error:
-        raise _unreadable(path, error) from None
-    except pa.ArrowException as error:
-        raise _unreadable(path, error) from None
+        ) as file,
+    ):
+        _refuse_bombs(path, file.metadata, texts=True)
+        batch = next(file.iter_batches(batch_size=64, columns=list(text)))
+        first = {c: cell_text.text(batch.column(c)).tolist() for c in text}
     return frozenset(c for c in text if cell_text.kind(first[c], comma=False) == "date")
 
 
@@ -257,11 +242,20 @@ def _refuse_bombs(path: Path, metadata: Any, *, texts: bool) -> None:
             )
 
 
-def _unreadable(path: Path, error: Exception) -> LogError:
-    if isinstance(error, LogError):
-        return error
-    reason = " ".join(str(error).split())[:200].rstrip(".")
-    return LogError(
-        f"cannot read '{path.name}' as Parquet: {reason}. "
-        f"Export it again, or give the file the ending of its format."
-    )
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Say in one sentence that a file cannot be read, whatever a damaged footer or page raises."""
+    import pyarrow as pa
+
+    try:
+        yield
+    except LogError:
+        raise
+    except (
+        pa.ArrowException, OSError, ValueError, KeyError, MemoryError, StopIteration, OverflowError,
+    ) as error:  # fmt: skip
+        reason = " ".join(str(error).split())[:200].rstrip(".")
+        raise LogError(
+            f"cannot read '{path.name}' as Parquet: {reason}. "
+            f"Export it again, or give the file the ending of its format."
+        ) from None

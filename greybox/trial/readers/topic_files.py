@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.trial.raw_log import Array
 from greybox.trial.readers.ros.axes import (
+    OTHER_CLOCK,
     compass_heading,
     frame_name,
     is_frd,
@@ -29,11 +31,7 @@ from greybox.trial.readers.ros.axes import (
 from greybox.trial.readers.table import Batch, TableFile
 from greybox.units import EARLIEST_UNIX, unix_seconds
 
-Array = NDArray[np.float64]
-
 STAMP = "header_stamp"
-# beyond this a header was stamped by another clock than the recorder's
-_OTHER_CLOCK = 3600.0
 # between the clocks of two time zones there are whole quarters of an hour, and a short delay
 QUARTER = 900.0
 ZONE_DELAY = 10.0
@@ -177,7 +175,7 @@ def as_topic(table: TableFile) -> TableFile:
     # headers that nobody stamps hold zero
     if made is not None and np.isfinite(made.make(first)).any():
         ahead = _ahead(first, made, recorder, table) if recorder else None
-        if ahead is not None and abs(ahead) > _OTHER_CLOCK and zone_of(ahead) is None:
+        if ahead is not None and abs(ahead) > OTHER_CLOCK and zone_of(ahead) is None:
             found.remarks.append(
                 f"the header stamps are {ahead:.6g} s behind '{recorder}', which is no time zone: "
                 f"they come from another clock, and '{recorder}' is used"

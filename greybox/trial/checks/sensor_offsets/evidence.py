@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from greybox.numerics.lagged_moments import bartlett, weighted_lags
 from greybox.trial.checks.motion import GAINS, outlier_weights, solve, whiten, without_starts
 from greybox.trial.checks.sensor_offsets.model import BIAS, CLOCKS, SIZE, KinematicModel, Residuals
-
-Array = NDArray[np.float64]
+from greybox.trial.raw_log import Array
 
 # wide enough to see a whole turn, which tells a late compass from a lever arm [s], [deg]
 _SCAN = (-8.0, -6.0, -4.5, -3.0, -2.0, -1.0, 1.0, 2.0, 3.0, 4.5, 6.0, 8.0)
@@ -71,8 +70,8 @@ class Likelihood:
         self._blocks, level = [], 0.0
         for z, x in self._parts(residuals):
             own = np.concatenate([z[:, :, None], x[:, :, SIZE:]], axis=2)
-            found = min((self._tried(own, float(gain)) for gain in GAINS), key=_first)
-            _, gain, weight = found
+            tried = (self._tried(own, float(gain)) for gain in GAINS)
+            _, gain, weight = min(tried, key=lambda x: x[0])
             white = self._white(own, gain, 1.0, weight).reshape(-1, own.shape[2])
             rest = white[:, 0] - white[:, 1:] @ solve(white[:, 1:], white[:, 0])
             std = float(np.sqrt(np.mean(rest**2)))
@@ -142,10 +141,6 @@ class Likelihood:
         return 0.5 * rest.size * float(np.log(variance)), gain, weight
 
 
-def _first(tried: tuple[float, float, Array]) -> float:
-    return tried[0]
-
-
 def fit(likelihood: Likelihood, start: Array, prior: Array) -> Array:
     """Return the offsets that fit one log best near `start`, by Gauss-Newton.
 
@@ -161,16 +156,11 @@ def fit(likelihood: Likelihood, start: Array, prior: Array) -> Array:
     tie, offsets = likelihood.tie, start
     expected, weight = prior
     free = tie.free
-
-    def cost(at: Array) -> float:
-        return likelihood.misfit(at) + 0.5 * float(np.sum(weight * (at - expected) ** 2))
-
     best, least = offsets, np.inf
     for _ in range(_ROUNDS):
         tie.align(offsets)
         residuals = tie.residuals(offsets)
-        level = likelihood.adapt(residuals)
-        level += 0.5 * float(np.sum(weight * (offsets - expected) ** 2))
+        level = likelihood.adapt(residuals) + _unlikely(offsets, prior)
         if level > least + _LEAST_LOSS:
             # downhill for the weights of the round before only
             return best
@@ -181,9 +171,10 @@ def fit(likelihood: Likelihood, start: Array, prior: Array) -> Array:
         pull = flat.T @ y.reshape(-1) - weight[free] * (offsets - expected)[free]
         step = np.zeros(SIZE)
         step[free] = np.clip(np.linalg.solve(normal, pull), -4.0, 4.0)
-        now = 0.5 * float(np.sum(y**2)) + 0.5 * float(np.sum(weight * (offsets - expected) ** 2))
+        now = 0.5 * float(np.sum(y**2)) + _unlikely(offsets, prior)
         for _ in range(4):
-            if cost(offsets + step) < now + 1e-6:
+            tried = offsets + step
+            if likelihood.misfit(tried) + _unlikely(tried, prior) < now + 1e-6:
                 break
             step = 0.4 * step
         offsets = offsets + step
@@ -238,10 +229,14 @@ def _best_place(likelihood: Likelihood, offsets: Array) -> tuple[float, Array]:
 
 def level(likelihood: Likelihood, offsets: Array, prior: Array) -> float:
     """Return minus the log-likelihood at some offsets, with what is expected of them."""
-    expected, weight = prior
     likelihood.tie.align(offsets)
-    found = likelihood.adapt(likelihood.tie.residuals(offsets))
-    return found + 0.5 * float(np.sum(weight * (offsets - expected) ** 2))
+    return likelihood.adapt(likelihood.tie.residuals(offsets)) + _unlikely(offsets, prior)
+
+
+def _unlikely(offsets: Array, prior: Array) -> float:
+    """Return minus the log-likelihood of offsets beside what is expected of them."""
+    expected, weight = prior
+    return 0.5 * float(np.sum(weight * (offsets - expected) ** 2))
 
 
 def _places(tie: KinematicModel, offsets: Array) -> list[tuple[Array, bool]]:

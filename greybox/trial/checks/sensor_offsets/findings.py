@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.notebook import with_error
 from greybox.numerics.parallel import map_forked
@@ -26,11 +25,7 @@ from greybox.trial.checks.sensor_offsets.evidence import (
     level,
     search,
 )
-from greybox.trial.checks.sensor_offsets.input_clock import (
-    Delay,
-    input_clocks,
-    response_delays,
-)
+from greybox.trial.checks.sensor_offsets.input_clock import input_clocks, response_delays
 from greybox.trial.checks.sensor_offsets.model import ARM, BIAS, CLOCKS, SIZE, KinematicModel
 from greybox.trial.checks.sensor_offsets.pool import Pooled, pool
 from greybox.trial.checks.sensor_offsets.select import (
@@ -52,11 +47,9 @@ from greybox.trial.checks.sensor_offsets.thresholds import (
     least,
     most_arm,
 )
-from greybox.trial.raw_log import Recording
-from greybox.trial.steps import Step, mend
+from greybox.trial.raw_log import Array, Recording
+from greybox.trial.steps import mend
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 IDS = ("clock_offset", "lever_arm", "heading_bias")
 # beyond these nothing can be said: [rad], [s], [m] and share of the length
@@ -147,7 +140,7 @@ def _base(clocks: list[Defect], campaign: Campaign, vessel: Vessel) -> _Base:
         return _Base()
     delays = response_delays(campaign.recordings, vessel)
     may = [k for k in input_clocks(delays, all_clocks, vessel) if k in (0, positions[0])]
-    seen = _delays_in_words(delays)
+    seen = ", ".join(f"{n} answers after {d.value:.1f} s" for n, d in sorted(delays.items()))
     against = _list(_words(clocks[0].against))
     if may == [0]:
         return _Base(words=f"the thrusters' columns share the clock of {against} ({seen})")
@@ -162,11 +155,6 @@ def _base(clocks: list[Defect], campaign: Campaign, vessel: Vessel) -> _Base:
     )
 
 
-def _delays_in_words(delays: dict[str, Delay]) -> str:
-    said = [f"{n} answers after {d.value:.1f} s" for n, d in sorted(delays.items())]
-    return ", ".join(said)
-
-
 def _clock_finding(d: Defect, base: _Base, campaign: Campaign) -> Finding:
     value, std = float(d.value[0]), float(np.sqrt(d.covariance[0, 0]))
     channels, against = d.channels, d.against
@@ -178,7 +166,6 @@ def _clock_finding(d: Defect, base: _Base, campaign: Campaign) -> Finding:
     if base.channels and "x_n" in d.channels:
         # the positions stand on the inputs' clock: the others are moved to it
         moved, late = d.against, -base.late
-    steps = _shift(moved, late)
     names = _list(channels)
     half = ""
     if "x_n" in d.channels and abs(abs(value) - 0.5 * campaign.step) < max(2.5 * std, 0.02):
@@ -196,13 +183,9 @@ def _clock_finding(d: Defect, base: _Base, campaign: Campaign) -> Finding:
         f"shift {_list(moved)} by {-late:+.2f} s (import --fix does), and look for the delay in "
         f"the logger or a filter",
         channels,
-        steps,
+        (mend("shift", moved, late=late),),
         True,
     )
-
-
-def _shift(channels: tuple[str, ...], late: float) -> tuple[Step, ...]:
-    return (mend("shift", channels, late=late),)
 
 
 def _list(names: tuple[str, ...] | list[str]) -> str:

@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.trial.checks.motion import (
     GAINS,
@@ -18,15 +17,14 @@ from greybox.trial.checks.motion import (
     integrate,
     integrated_damping,
     make_motion,
+    orderly,
     solve,
     whiten,
     without_starts,
 )
-from greybox.trial.raw_log import Recording
+from greybox.trial.raw_log import Array, Recording
 from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 # delays that are tried [s]
 _DELAYS = np.round(np.arange(-3.0, 6.01, 0.1), 10)
@@ -133,13 +131,11 @@ def _profiles(
     fine = np.arange(start, stop, 0.1)
     held = {}
     for c in vessel.commands:
-        s = recording[c]
-        keep = np.flatnonzero(s.known)
-        if len(keep) < 2:
+        s = orderly(recording[c], angular=False)
+        if len(s) < 2:
             return {}
-        keep = keep[np.argsort(s.t[keep], kind="stable")]
         # between samples, not held: a sample says nothing of when the value was taken up
-        held[c] = np.interp(fine, s.t[keep], s.value[keep])
+        held[c] = np.interp(fine, s.t, s.value)
     force = generalised_force(vessel, held)
     found = {}
     for state in states:

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.numerics.robust import robust_deviation
-from greybox.trial.checks.motion import Motion, denoise, integrate, smooth, to_ned
-
-Array = NDArray[np.float64]
+from greybox.trial.checks.motion import Motion, denoise, integrate, slope, smooth, to_ned
+from greybox.trial.raw_log import Array
 
 # order of the parameters: lateness by channel [s], lever arm [m], heading bias [rad]
 CLOCKS = ("psi", "u", "v", "r")
@@ -93,13 +92,13 @@ class KinematicModel:
         late = self._late(offsets)
         slow = {k: self._channel(k).slow(late[k]) for k in CLOCKS if k in m}
         now = {k: slow[k] + self._channel(k).noise(late[k]) for k in slow}
-        rate = {k: self._slope(v) for k, v in slow.items()}
+        rate = {k: slope(v, m) for k, v in slow.items()}
         position, columns = np.zeros((n, 2)), np.zeros((n, 2, SIZE + 4))
         if self.positioned:
             bias, arm = offsets[BIAS], offsets[ARM]
             psi = slow["psi"] - bias
             lever = to_ned(psi, np.full(n, arm[0]), np.full(n, arm[1]))
-            walked = self._walked(now["psi"] - bias, now["u"], now["v"])
+            walked = integrate(to_ned(now["psi"] - bias, now["u"], now["v"]), m)
             position = np.column_stack([m["x_n"], m["y_n"]]) - walked - lever
             ahead = to_ned(psi, rate["u"], np.zeros(n))
             aside = to_ned(psi, np.zeros(n), rate["v"])
@@ -140,16 +139,6 @@ class KinematicModel:
             self._channels[name] = _Channel(self.motion[name], self.smooth[name], self.motion)
         return self._channels[name]
 
-    def _walked(self, psi: Array, u: Array, v: Array) -> Array:
-        """Return the way made by velocities and heading (N, 2) [m]."""
-        return integrate(to_ned(psi, u, v), self.motion)
-
-    def _slope(self, value: Array) -> Array:
-        out = np.empty_like(value)
-        for a, b in self.motion.stretches:
-            out[a:b] = np.gradient(value[a:b], self.motion.step)
-        return out
-
 
 class _Channel:
     """One channel as it would be were it not late: its noise-free part, and its noise.
@@ -188,8 +177,8 @@ class _Channel:
             moved[:] = spline(at)
             reach = min(5, b - a - 1)
             for inside, k, j in ((at < t[0], 0, reach), (at > t[-1], -1, -1 - reach)):
-                slope = (value[k] - value[j]) / (t[k] - t[j])
-                moved[inside] = value[k] + slope * (at[inside] - t[k])
+                rate = (value[k] - value[j]) / (t[k] - t[j])
+                moved[inside] = value[k] + rate * (at[inside] - t[k])
         return out
 
     def noise(self, late: float) -> Array:

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from greybox.trial.checks.sensor_offsets.evidence import Evidence
 from greybox.trial.checks.sensor_offsets.model import ARM, BIAS, CLOCKS, SIZE
 from greybox.trial.checks.sensor_offsets.thresholds import CAMPAIGN, SIGMAS
-
-Array = NDArray[np.float64]
+from greybox.trial.raw_log import Array, Mask
 
 # instruments that change between campaigns as one: the positions against all, heading, velocities,
 # yaw rate, antenna, compass
@@ -77,7 +76,7 @@ class Pooled:
     offsets: Array
     covariance: Array
     scatter: Array
-    differing: NDArray[np.bool_]
+    differing: Mask
 
 
 def pool(

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.trial.checks.sensor_offsets.model import ARM, BIAS, CLOCKS, SIZE
 from greybox.trial.checks.sensor_offsets.thresholds import (
@@ -22,9 +21,9 @@ from greybox.trial.checks.sensor_offsets.thresholds import (
     least_arm,
     most_arm,
 )
+from greybox.trial.raw_log import Array
 from greybox.vessel.vessel import Vessel
 
-Array = NDArray[np.float64]
 Clock = tuple[str, ...]
 
 # all positions stand for one sensor
@@ -143,7 +142,7 @@ def hypotheses(channels: tuple[str, ...], *, turned: bool) -> Iterator[Hypothesi
     names += ["r"] if turned else []
     flags = (False, True) if positioned else (False,)
     for parts in _partitions(names):
-        clocks = tuple(sorted((tuple(p) for p in parts), key=_standing, reverse=True))
+        clocks = tuple(sorted((tuple(p) for p in parts), key=_weight, reverse=True))
         for arm in flags:
             for bias in flags:
                 yield Hypothesis(clocks, arm, bias)
@@ -191,11 +190,7 @@ def score_hypotheses(
         cost = _cost(h, defects, vessel)
         score = 0.5 * (explained - whole) - cost
         found.append(Judged(h, score, cost, estimate + null, spread, defects))
-    return sorted(found, key=_score, reverse=True)
-
-
-def _score(judged: Judged) -> float:
-    return judged.score
+    return sorted(found, key=lambda judged: judged.score, reverse=True)
 
 
 def matters(defect: Defect, vessel: Vessel, antenna: Array) -> bool:
@@ -213,7 +208,7 @@ def separation(judged: list[Judged], defect: Defect) -> tuple[float, Judged | No
     """Return by how much all hypotheses without a defect explain less, and the best of them."""
     best = judged[0]
     for other in judged:
-        if not any(_same(defect, d) for d in other.defects):
+        if (defect.id, defect.channels) not in ((d.id, d.channels) for d in other.defects):
             return best.score - other.score, other
     return np.inf, None
 
@@ -223,10 +218,6 @@ def possible(defect: Defect, vessel: Vessel) -> bool:
     if defect.id == "lever_arm":
         return bool(np.hypot(*defect.value) <= most_arm(vessel))
     return defect.id != "clock_offset" or abs(float(defect.value[0])) <= MOST_LATE
-
-
-def _same(one: Defect, two: Defect) -> bool:
-    return one.id == two.id and one.channels == two.channels
 
 
 def _defects(h: Hypothesis, offsets: Array, covariance: Array) -> Iterator[Defect]:
@@ -273,7 +264,7 @@ def _cost(h: Hypothesis, defects: tuple[Defect, ...], vessel: Vessel) -> float:
     return float(total)
 
 
-def _standing(clock: Clock) -> float:
+def _weight(clock: Clock) -> float:
     return sum(_WEIGHT[n] for n in clock)
 
 

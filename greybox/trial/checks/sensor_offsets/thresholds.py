@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.trial.checks.sensor_offsets.model import ARM, BIAS, CLOCKS, SIZE
+from greybox.trial.raw_log import Array
 from greybox.vessel.vessel import Vessel
-
-Array = NDArray[np.float64]
 
 # what is too small to matter: [s], [rad], [m] and share of the ship's length
 LEAST_CLOCK = 0.1

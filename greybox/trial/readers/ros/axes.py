@@ -21,10 +21,11 @@ Value = TypeVar("Value", float, NDArray[np.float64])
 Fields = dict[str, float]
 Remarks = dict[str, None]
 
+# beyond this a header was stamped by another clock than the recorder's [s]
+OTHER_CLOCK = 3600.0
+
 # frames whose axes are those of the world, whatever the message
 WORLD_FRAMES = frozenset({"map", "odom", "world", "earth", "enu", "ned", "utm"})
-
-
 # what the body is called
 BODY_FRAMES = frozenset({"base_link", "base_footprint", "base", "body"})
 

@@ -16,7 +16,13 @@ from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.raw_log import Array, Recording, Signal, SourceFile, free_name, shortened
 from greybox.trial.readers.limits import limits
-from greybox.trial.readers.ros.axes import HANDLERS, Fields, SkippedMessageError, unsure_fields
+from greybox.trial.readers.ros.axes import (
+    HANDLERS,
+    OTHER_CLOCK,
+    Fields,
+    SkippedMessageError,
+    unsure_fields,
+)
 from greybox.trial.readers.ros.bags import read_messages, storage_files
 from greybox.trial.readers.ros.messages import (
     Decoded,
@@ -27,9 +33,6 @@ from greybox.trial.readers.ros.messages import (
 )
 from greybox.trial.readers.ros.storage import Budget, Channel
 from greybox.units import is_unix_time
-
-# beyond this a header was stamped by another clock than the recorder's
-_CLOCKS = 3600.0
 
 _UNITS = {"lat": "deg", "lon": "deg", "altitude": "m"} | {
     name: CHANNELS[name].unit for name in ("x_n", "y_n", "psi", "u", "v", "r")
@@ -255,7 +258,7 @@ class _Topic:
         if not self.stamped:
             return logged
         late = float(np.median((logged.astype(float) - stamps.astype(float)) * 1e-9))
-        if abs(late) > _CLOCKS:
+        if abs(late) > OTHER_CLOCK:
             notes.append(
                 f"the headers of '{topic}' are {late:.6g} s before the recorder's clock, so they "
                 f"come from another clock: the recorder's time was used."
