@@ -402,6 +402,7 @@ def _run_for_coefficients(
         request = least_duration(
             request,
             dict(_target(text) for text in options.target),
+            best_effort=options.best_effort,
             progress=progress("duration"),
             workers=options.workers,
         )
@@ -529,8 +530,9 @@ def _prepared(
     from experiment_design.request.regimes import state_words
     from greybox.errors import InfeasibleError
 
+    best_effort = options.best_effort
     if sailed is None or options.start is not None:
-        return prepare_request(model, asked, vessel), False
+        return prepare_request(model, asked, vessel, best_effort=best_effort), False
     ended = state_words(model.structure.states, sailed.end)
     try:
         found = prepare_request(model, replace(asked, start=sailed.end), vessel)
@@ -540,7 +542,7 @@ def _prepared(
     if not lacking:
         said = f"it starts where the last log ended: {ended} (--start to change)"
         return replace(found, notes=(said, *found.notes)), True
-    found = prepare_request(model, asked, vessel)
+    found = prepare_request(model, asked, vessel, best_effort=best_effort)
     said = (
         f"the last log ended with {ended}, where {lacking} does not keep its margin: steady the "
         f"ship before this plan begins"

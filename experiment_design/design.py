@@ -26,6 +26,7 @@ from experiment_design.feasibility.checks import (
 )
 from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
+    keep_probability,
     tightened_campaign,
 )
 from experiment_design.feasibility.least_violation import closest, moved_constant, perturbed
@@ -60,6 +61,8 @@ Array = NDArray[np.float64]
 
 # scaled units from which a limit counts as active; iterations and seconds of the polish
 _NEAR, _POLISH, _PATIENCE = 0.1, 40, 3600.0
+# how a design ended that keeps not all of its limits
+CLOSEST = "limits not kept: the closest plan that was found"
 
 _log = logging.getLogger(__name__)
 
@@ -110,7 +113,7 @@ def design_trial(
     """
     began = time.perf_counter()
     require_horizon(request)
-    request = after_lead_in(request)
+    request = after_lead_in(request, best_effort=best_effort)
     problems = [build_problem(request, t) for t in range(request.trials)]
     _log.info(
         "%d trial(s) of %g s, %d levels each, criterion %s", len(problems), request.duration,
@@ -122,7 +125,7 @@ def design_trial(
     _log.info("%d random two-level sequences keep the limits", kept)
     if reference is None:
         require_stable(request)
-    else:
+    elif request.out_of_reach is None:
         require_informative(request, problems, reference, hopeless=10.0)
     initial = reference
     if reference is None:
@@ -170,8 +173,11 @@ def design_trial(
         if sentence:
             if not best_effort:
                 raise InfeasibleError(sentence)
-            status = "limits not kept: the closest plan that was found"
+            status = CLOSEST
             notes.append(sentence)
+    if (told := request.out_of_reach) is not None:
+        status = CLOSEST
+        notes += [told.sentence, f"this plan was designed for {request.stand_ins} instead"]
     keeping: ConstraintSatisfaction | None = None
     if request.uncertain and not stopped:
         try:
@@ -185,8 +191,12 @@ def design_trial(
     covariance = covariance_of(problems, units)
     if not np.isfinite(covariance).all() and not request.contrasts:
         raise InfeasibleError(unexcited(problems, units, request))
-    if not missing or not best_effort:
+    try:
         notes += require_informative(request, problems, units)
+    except InfeasibleError as error:
+        if not best_effort or status != CLOSEST:
+            raise
+        notes.append(str(error))
     notes += missed_targets(request, problems, units)
     certificate = absent("the user stopped the design")
     if not stopped:
@@ -271,6 +281,12 @@ def described(
         motions = (_behind(request, run_through(request, levels[0])),)
     reports = _limit_reports(request, problems, motions, levels)
     late = late_notes(request, problems, motions, reports, covariance)
+    if request.out_of_reach is not None:
+        asked = request.as_asked()
+        reports = _limit_reports(
+            asked, [build_problem(asked, t) for t in range(asked.trials)], motions, levels
+        )
+        keeping = None if keeping is None else keep_probability(asked, units)
     design = Design(
         request,
         commands,

@@ -28,6 +28,7 @@ def least_duration(
     request: PreparedRequest,
     targets: Mapping[str, float],
     *,
+    best_effort: bool = False,
     progress: Progress | None = None,
     workers: int | None = None,
 ) -> PreparedRequest:
@@ -39,6 +40,8 @@ def least_duration(
         Its duration, behind a lead-in, is the longest that is allowed.
     targets : mapping of str to float
         Wanted standard error of each named parameter, in its unit.
+    best_effort : bool
+        See `design_trial`.
     progress : callable, optional
         Called with steps done and steps in all.
     workers : int, optional
@@ -61,7 +64,7 @@ def least_duration(
     for name, value in targets.items():
         if not 0 < value < np.inf:
             raise UsageError(f"the target of {name} is {value:g}, it must be positive.")
-    request = after_lead_in(request)
+    request = after_lead_in(request, best_effort=best_effort)
     predictor = request.build_predictor()
     # of two names of one column the one with the smaller target
     told: dict[int, str] = {}

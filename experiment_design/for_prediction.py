@@ -173,10 +173,7 @@ class PredictionDesign:
             )
         if self.design.keeping is not None:
             lines.append(self.design.keeping.sentence())
-        broken = [
-            f"{x.name}: missed by {x.missed:.3g} {x.unit}" for x in self.design.limits if x.missed
-        ]
-        lines += broken
+        lines += self.design.missed()
         return "\n".join([*lines, *[f"Note: {n}" for n in self.design.notes]])
 
 

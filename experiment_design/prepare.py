@@ -8,7 +8,6 @@ from dataclasses import fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.constraints.limits import TrialLimits
 from experiment_design.feasibility.checks import ROOM, tells_enough
 from experiment_design.feasibility.stability import unstable_sentence
 from experiment_design.information.estimators import ESTIMATORS
@@ -37,6 +36,8 @@ from experiment_design.request.regimes import (
 )
 from experiment_design.request.request import (
     DesignRequest,
+    OutOfReach,
+    OutOfReachError,
     PreparedRequest,
     TrialOptions,
     build_problem,
@@ -64,7 +65,11 @@ _GUSTINESS = 0.15
 
 
 def prepare_request(
-    model: ManoeuvringModel, asked: DesignRequest, vessel: Vessel | None = None
+    model: ManoeuvringModel,
+    asked: DesignRequest,
+    vessel: Vessel | None = None,
+    *,
+    best_effort: bool = False,
 ) -> PreparedRequest:
     """Complete what a user asked for.
 
@@ -75,6 +80,8 @@ def prepare_request(
     asked : DesignRequest
     vessel : Vessel, optional
         With limits and sensors; by default the model's own.
+    best_effort : bool
+        Where no steady motion keeps the margins, those nearest to them take their place.
 
     Returns
     -------
@@ -90,6 +97,26 @@ def prepare_request(
     InfeasibleError
         No motion within the limits keeps the wanted signs.
     """
+    try:
+        return _prepared(model, asked, vessel)
+    except OutOfReachError as error:
+        told = error.told
+        if not best_effort or told.instead is None:
+            raise
+        own = {
+            n: m
+            for n, m in told.instead.margins.items()
+            if n in asked.limits.margins or m != told.asked.margins[n]
+        }
+        within = replace(asked, limits=replace(asked.limits, margins=own))
+        # trials of several regimes may each need lower ones
+        found = prepare_request(model, within, vessel, best_effort=True)
+        return replace(found, out_of_reach=told)
+
+
+def _prepared(
+    model: ManoeuvringModel, asked: DesignRequest, vessel: Vessel | None
+) -> PreparedRequest:
     changes = (*model.changes, *(asked.prior.changes if asked.prior is not None else ()))
     notes: list[str] = [
         f"{c.sentence}, and the trial is designed for what it is from then on"
@@ -154,6 +181,7 @@ def prepare_request(
                 f"terms could not be told from the water's (--gust to change)"
             )
     margins, chosen = _margins(model, structure, noise.measurement, asked)
+    chosen = {state: note for state, note in chosen.items() if state in signed}
     notes += chosen.values()
     of_regime = [note for state, note in chosen.items() if state != "u"]
     if (np.diag(model.covariance) < 0).any():
@@ -202,7 +230,7 @@ def prepare_request(
         for signs in regimes:
             begin = steady_start(steady, structure.states, signs, margins, caps)
             if begin is not None and _depth(begin.state, signs, margins, structure.states) < -1e-6:
-                raise InfeasibleError(_beyond_reach(base, steady, [signs], asked.limits))
+                raise OutOfReachError(_beyond_reach(base, steady, [signs]))
     begun = [
         _start_of(signs, start, steady, structure, margins, caps, asked.trials) for signs in regimes
     ]
@@ -340,7 +368,7 @@ def _start_of(
     caps: tuple[float | None, float | None],
     trials: int,
 ) -> Start:
-    if start is not None and all(start[structure.states.index(s)] * v >= 0 for s, v in signs):
+    if start is not None and _agrees(start, signs, structure.states):
         return Start(start)
     if start is not None and trials == 1:
         name, sign = next((s, v) for s, v in signs if start[structure.states.index(s)] * v < 0)
@@ -364,6 +392,11 @@ def _start_of(
     return found
 
 
+def _agrees(start: Array, signs: Signs, states: tuple[str, ...]) -> bool:
+    """Whether a start has the signs of a regime."""
+    return all(start[states.index(s)] * v >= 0 for s, v in signs)
+
+
 def _depth(
     start: Array, signs: Signs, margins: Mapping[str, float], states: tuple[str, ...]
 ) -> float:
@@ -381,12 +414,11 @@ def _clear_of_wind(start: Array, base: PreparedRequest) -> Array:
     return np.append(start[:-1], clear_heading(np.array(velocity), np.asarray(base.d[2:], float)))
 
 
-def _beyond_reach(
-    base: PreparedRequest, steady: Steady, candidates: list[Signs], limits: TrialLimits
-) -> str:
+def _beyond_reach(base: PreparedRequest, steady: Steady, candidates: list[Signs]) -> OutOfReach:
     """Return what margins steady motions reach, and which leave a trial room to tell enough."""
-    states, asked = base.structure.states, dict(base.limits.margins)
-    caps = (limits.speed_cap, limits.yaw_cap)
+    states, signed = base.structure.states, dict(candidates[0])
+    asked = {s: m for s, m in base.limits.margins.items() if s in signed}
+    caps = (base.limits.speed_cap, base.limits.yaw_cap)
     shown = ", ".join(f"{k} {v:.3g}" for k, v in asked.items())
     # the motion that keeps the largest share of every margin
     share, reached, held = -np.inf, asked, candidates[0]
@@ -401,8 +433,8 @@ def _beyond_reach(
             reached = {s: float(kept[best, i]) for i, (s, _) in enumerate(signs)}
     best_shown = ", ".join(f"{k} {v:.3g}" for k, v in reached.items())
     said = (
-        f"no steady motion keeps the margins {shown} m/s: the one that comes closest within the "
-        f"limits of the thrusters keeps {best_shown} m/s."
+        f"no steady motion keeps the margin{'s' if len(asked) > 1 else ''} {shown} m/s: the one "
+        f"that comes closest within the limits of the thrusters keeps {best_shown} m/s."
     )
     for part in ROOM:
         margins = {s: min(v, np.floor(1e3 * part * reached[s]) / 1e3) for s, v in asked.items()}
@@ -415,12 +447,14 @@ def _beyond_reach(
             base,
             regimes=(held,) * base.trials,
             starts=(_clear_of_wind(start.state, base),) * base.trials,
-            limits=replace(base.limits, margins=asked | margins),
+            limits=replace(base.limits, margins={**base.limits.margins, **margins}),
         )
         if tells_enough(eased):
-            options = " ".join(f"--margin-{n} {v:g}" for n, v in margins.items())
-            return f"{said} Use {options}, or widen the limits."
-    return f"{said} Widen the limits of the thrusters, or lower the margins far below these."
+            told = OutOfReach(base.limits, eased.limits, said)
+            options = eased.eased(told).stand_ins
+            return replace(told, sentence=f"{said} Use {options}, or widen the limits.")
+    said += " Widen the limits of the thrusters, or lower the margins far below these."
+    return OutOfReach(base.limits, None, said)
 
 
 def _choose_regimes(
@@ -434,19 +468,19 @@ def _choose_regimes(
     states = base.structure.states
     margins = dict(base.limits.margins)
     worth: list[tuple[float, Signs]] = []
-    for signs in candidate_regimes(states):
+    candidates = candidate_regimes(states)
+    if start is not None and asked.trials == 1:
+        candidates = [c for c in candidates if _agrees(start, c, states)]
+    for signs in candidates:
         caps = (asked.limits.speed_cap, asked.limits.yaw_cap)
         begin = steady_start(steady, states, signs, margins, caps)
         if begin is None:
             continue
         own = _clear_of_wind(begin.state, base)
-        if start is not None:
-            if any(start[states.index(s)] * v < 0 for s, v in signs):
-                if asked.trials == 1:
-                    continue
-            elif asked.trials > 1 or _depth(start, signs, margins, states) >= 0:
-                # else a lead-in brings her to where the regime can be judged
-                own = start
+        held = start is not None and _agrees(start, signs, states)
+        if held and (asked.trials > 1 or _depth(start, signs, margins, states) >= 0):
+            # else a lead-in brings her to where the regime can be judged
+            own = start
         if _depth(own, signs, margins, states) < -1e-6 and own is not start:
             continue
         try:
@@ -464,8 +498,7 @@ def _choose_regimes(
             value = float(problem.evaluate(np.array(units)).value[0])
         worth.append((value, signs))
     if not worth:
-        candidates = candidate_regimes(states)
-        raise InfeasibleError(_beyond_reach(base, steady, candidates, asked.limits))
+        raise OutOfReachError(_beyond_reach(base, steady, candidates))
     worth.sort(key=lambda item: -item[0])
     chosen = [signs for _, signs in worth]
     if asked.trials == 1:

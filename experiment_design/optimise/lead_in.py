@@ -18,8 +18,15 @@ from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TOLERANCE, Limit, PathLimit
 from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.excitation.schedule import Schedule
+from experiment_design.feasibility.checks import tells_enough
 from experiment_design.request.regimes import state_words
-from experiment_design.request.request import LeadIn, PreparedRequest, build_problem
+from experiment_design.request.request import (
+    LeadIn,
+    OutOfReach,
+    OutOfReachError,
+    PreparedRequest,
+    build_problem,
+)
 from greybox.errors import InfeasibleError
 
 Array = NDArray[np.float64]
@@ -64,6 +71,8 @@ def find_lead_in(request: PreparedRequest) -> LeadIn | None:
     ------
     InfeasibleError
         There is none of at most 120 s; says which limit stops it and what helps.
+    OutOfReachError
+        That limit is a margin.
     """
     if request.trials > 1 or request.contrasts or not short_of_margin(request):
         return None
@@ -78,12 +87,25 @@ def find_lead_in(request: PreparedRequest) -> LeadIn | None:
         found = _Shooting(request, holds).search()
         if found is not None:
             return found
-    raise InfeasibleError(_refusal(request, most))
+    raise _refusal(request, most)
 
 
-def after_lead_in(request: PreparedRequest) -> PreparedRequest:
-    """Return the request of the trial behind the lead-in that `find_lead_in` finds, if any."""
-    found = find_lead_in(request)
+def after_lead_in(request: PreparedRequest, *, best_effort: bool = False) -> PreparedRequest:
+    """Return the request of the trial behind the lead-in that `find_lead_in` finds, if any.
+
+    Parameters
+    ----------
+    request : PreparedRequest
+    best_effort : bool
+        Margins that one leads to take the place of those out of reach.
+    """
+    try:
+        found = find_lead_in(request)
+    except OutOfReachError as error:
+        if not best_effort:
+            raise
+        request = request.eased(error.told)
+        found = find_lead_in(request)
     return request if found is None else found.after(request)
 
 
@@ -216,8 +238,8 @@ class _Shooting:
         return -self.schedule.sample_time / np.log(slowest) if 0 < slowest < 1 else np.inf
 
 
-def _refusal(request: PreparedRequest, holds: int) -> str:
-    """Return which limit stops a lead-in, and the least change that was found to help."""
+def _refusal(request: PreparedRequest, holds: int) -> InfeasibleError:
+    """Return the error on which limit stops a lead-in, and the least change found to help."""
     shooting = _Shooting(request, holds)
     missed = shooting.nearest()
     start = state_words(request.structure.states, request.starts[0])
@@ -238,18 +260,22 @@ def _refusal(request: PreparedRequest, holds: int) -> str:
             amount = max((m for x, m in stopping if type(x) is type(limit)), default=0.0)
             helps = _relaxed(request, holds, limit, max(amount, 0.05 * limit.size))
             if helps:
-                return f"{said}: the {limit.phrase} stops it. {helps}"
+                return InfeasibleError(f"{said}: the {limit.phrase} stops it. {helps}")
         names = ", ".join(x.words for x in on_way)
-        return f"{said}: the {names} together stop it. Widen them, or change --start."
+        return InfeasibleError(
+            f"{said}: the {names} together stop it. Widen them, or change --start."
+        )
     limit, amount = next((item for item in stopping if item[0].of_regime), stopping[0])
     reached = limit.bound - max(amount - (_ENOUGH - 1) * max(limit.bound, _LEAST), 0.0)
     said += f": the {limit.phrase} stops it, {reached:.3g} is reached"
     for share in _SHARES if reached > 0 and limit.of_regime else ():
         lower = float(np.floor(1e3 * share * reached) / 1e3)
-        eased = limit.with_bound(request.limits, lower)
-        if _Shooting(replace(request, limits=eased), holds).search() is not None:
-            return f"{said}. Use {limit.option} {lower:g}, or a --start nearer to the regime."
-    return f"{said}. Choose another --regime, or a --start nearer to it."
+        eased = replace(request, limits=limit.with_bound(request.limits, lower))
+        found = _Shooting(eased, holds).search()
+        if found is not None and tells_enough(found.after(eased)):
+            said += f". Use {limit.option} {lower:g}, or a --start nearer to the regime."
+            return OutOfReachError(OutOfReach(request.limits, eased.limits, said))
+    return InfeasibleError(f"{said}. Choose another --regime, or a --start nearer to it.")
 
 
 def _relaxed(request: PreparedRequest, holds: int, limit: Limit, amount: float) -> str:

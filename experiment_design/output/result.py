@@ -156,6 +156,8 @@ class Design(DisplayMixin):
         if not (self.broken or self.doubtful):
             return ""
         r = self.request
+        if r.stand_ins:
+            return f"design it with {r.stand_ins}, or widen the limits of the thrusters"
         wider = "give it more room (--area, --circle), " if r.limits.area is not None else ""
         less = "narrow --envelope" if r.misfit is not None else "lower the margins"
         return (
@@ -284,6 +286,14 @@ class Design(DisplayMixin):
     def _behind(self) -> str:
         return f" behind a lead-in of {self.lead_in_s:g} s" if self.lead_in_s else ""
 
+    def missed(self) -> list[str]:
+        """Return the limits that are not kept, each with its bound and by how much."""
+        bounds = [f"{x.name} of {x.bound:g} {x.unit}".rstrip() for x in self.broken]
+        return [
+            f"{told}: missed by {x.missed:.3g} {x.unit}".rstrip()
+            for told, x in zip(bounds, self.broken, strict=True)
+        ]
+
     def summary(self) -> str:
         """Return the design as text."""
         r = self.request
@@ -306,6 +316,7 @@ class Design(DisplayMixin):
         margins = ", ".join(f"{k} {v:.3g}" for k, v in self.margins.items())
         if margins:
             lines.append(f"least distance from zero: {margins} (m/s, rad/s)")
+        lines += self.missed()
         if self.keeping is not None:
             lines.append(self.keeping.sentence())
         wide = max(14, *map(len, self.names))
@@ -358,11 +369,10 @@ class Design(DisplayMixin):
 
     def _parts(self) -> tuple[str, ...]:
         names = self.request.schedule.commands
-        missed = [f"{x.name}: missed by {x.missed:.3g} {x.unit}" for x in self.limits if x.missed]
         told = zip(self.names, self.values, self.std, strict=True)
         return (
             text(f"{self.certificate.sentence()[0].upper()}{self.certificate.sentence()[1:]}."),
-            items("Limits not kept", missed),
+            items("Limits not kept", self.missed()),
             table(
                 ("trial", "command", "least", "most", "over time"),
                 [

@@ -25,7 +25,7 @@ from experiment_design.information.estimators import ESTIMATORS
 from experiment_design.information.moments import Moments
 from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.problem import Scenario, TrialProblem
-from greybox.errors import UsageError, suggestion
+from greybox.errors import InfeasibleError, UsageError, suggestion
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Column, Predictor, Regime, build_predictor
@@ -213,6 +213,32 @@ class LeadIn:
         )
 
 
+@dataclass(frozen=True)
+class OutOfReach:
+    """Margins that were asked for and cannot be kept, and those that stand in for them.
+
+    Parameters
+    ----------
+    asked : TrialLimits
+    instead : TrialLimits or None
+        With the margins nearest to them that leave a trial room; None where none were found.
+    sentence : str
+        Which limit stops the trial, and what helps.
+    """
+
+    asked: TrialLimits
+    instead: TrialLimits | None
+    sentence: str
+
+
+class OutOfReachError(InfeasibleError):
+    """No motion keeps the margins; `told` says what comes closest."""
+
+    def __init__(self, told: OutOfReach) -> None:
+        super().__init__(told.sentence)
+        self.told = told
+
+
 @dataclass(frozen=True, kw_only=True)
 class PreparedRequest(TrialOptions):
     """Everything that a design depends on; equal requests give equal designs.
@@ -263,6 +289,8 @@ class PreparedRequest(TrialOptions):
         Whether the prior model comes from main dimensions, no trial behind it.
     lead_in : LeadIn, optional
         After which the only trial begins: `starts`, `limits` and `duration` are the trial's own.
+    out_of_reach : OutOfReach, optional
+        What was asked for, where `limits` have other margins for the closest plan.
     notes : tuple of str
         A sentence for each choice that was made for the user.
     of_regime : tuple of str
@@ -291,6 +319,7 @@ class PreparedRequest(TrialOptions):
     integrator: Integrator = "euler"
     untried: bool = False
     lead_in: LeadIn | None = None
+    out_of_reach: OutOfReach | None = None
     notes: tuple[str, ...] = ()
     of_regime: tuple[str, ...] = ()
 
@@ -303,6 +332,36 @@ class PreparedRequest(TrialOptions):
     def of_both_sides(self) -> tuple[str, ...]:
         """Notes that also hold for a plan of both sides."""
         return tuple(n for n in self.notes if n not in self.of_regime)
+
+    def eased(self, told: OutOfReach) -> PreparedRequest:
+        """Return the request of the closest plan to margins that cannot be kept.
+
+        Raises
+        ------
+        OutOfReachError
+            No margins were found that leave a trial room.
+        """
+        if told.instead is None:
+            raise OutOfReachError(told)
+        return replace(self, limits=told.instead, out_of_reach=told)
+
+    def as_asked(self) -> PreparedRequest:
+        """Return the request with the margins that were asked for."""
+        if self.out_of_reach is None:
+            return self
+        limits = replace(self.out_of_reach.asked, position=self.limits.position)
+        return replace(self, limits=limits, backoff=(), out_of_reach=None)
+
+    @property
+    def stand_ins(self) -> str:
+        """Margins that stand in for those out of reach, as options; empty where none do."""
+        if self.out_of_reach is None:
+            return ""
+        asked, own = self.out_of_reach.asked, self.limits
+        told = [f"--margin-{n} {m:g}" for n, m in own.margins.items() if m != asked.margins.get(n)]
+        if own.margin_air != asked.margin_air:
+            told.append(f"--margin-air {own.margin_air:g}")
+        return " ".join(told)
 
     @property
     def trials(self) -> int:

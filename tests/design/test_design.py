@@ -19,6 +19,7 @@ from experiment_design import (
     predict_precision,
     prepare_request,
 )
+from experiment_design.design import CLOSEST
 from experiment_design.excitation.inputs import multisines, prbs, random_two_level, zig_zags
 from experiment_design.feasibility.checks import missed_targets
 from experiment_design.optimise.campaign import Found, std_of
@@ -436,6 +437,37 @@ def test_the_closest_plan_on_request():
     design = design_trial(prepare_request(thesis_model(), asked), best_effort=True)
     assert design.status.startswith("limits not kept")
     assert any("headings cannot cover 30 rad" in n for n in design.notes)
+
+
+def test_the_closest_plan_to_margins_out_of_reach(monkeypatch):
+    """It keeps the margins nearest to them, and is held against those that were asked for."""
+    monkeypatch.setattr("experiment_design.optimise.campaign._LEAST", 20)
+    asked = DesignRequest(
+        60.0, TrialLimits(margins={"u": 9.0}), predictor="basic", effort=0.02, regime="u+"
+    )
+    model = thesis_model("surge", 0.05)
+    with pytest.raises(InfeasibleError, match="no steady motion keeps the margin u 9 m/s") as told:
+        prepare_request(model, asked)
+    request = prepare_request(model, asked, best_effort=True)
+    design = design_trial(request, workers=1, alternatives=False, best_effort=True)
+    assert design.status == CLOSEST
+    assert str(told.value) in design.notes
+    (report,) = design.limits
+    assert report.bound == 9.0
+    assert report.missed == pytest.approx(9.0 - design.margins["u"])
+    assert design.margins["u"] >= request.limits.margins["u"] - 1e-4
+    assert design.keeping.probability == 0.0
+    assert request.stand_ins in str(told.value)
+    assert request.stand_ins in design.remedy
+    assert "margin of surge of 9 m/s: missed by" in design.summary()
+
+
+def test_a_margin_out_of_reach_of_a_ship_that_crosses_zero_in_sway():
+    asked = DesignRequest(
+        60.0, TrialLimits(margins={"u": 9.0}), predictor="basic", effort=0.02, regime="u+"
+    )
+    with pytest.raises(InfeasibleError, match=r"the margin u 9 m/s: .* keeps u 2\.\d+ m/s\. Use"):
+        prepare_request(thesis_model(), asked)
 
 
 def test_an_unstable_prior():

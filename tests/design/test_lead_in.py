@@ -12,7 +12,13 @@ from experiment_design.constraints.limits import Circle, TrialLimits
 from experiment_design.design import design_trial
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.optimise.campaign import own_moments
-from experiment_design.optimise.lead_in import LONGEST, _Shooting, find_lead_in, short_of_margin
+from experiment_design.optimise.lead_in import (
+    LONGEST,
+    _Shooting,
+    after_lead_in,
+    find_lead_in,
+    short_of_margin,
+)
 from experiment_design.request.request import build_problem
 from greybox.errors import InfeasibleError
 
@@ -126,9 +132,17 @@ def test_the_descent_has_the_exact_gradient() -> None:
     ],
 )
 def test_a_refusal_names_the_limit_and_what_helps(limits, told) -> None:
+    request = at_rest(limits=limits)
     with pytest.raises(InfeasibleError, match="no lead-in of at most 120 s") as caught:
-        find_lead_in(at_rest(limits=limits))
+        find_lead_in(request)
     assert told in str(caught.value)
+    if "margins" not in limits:
+        return
+    # the closest plan begins behind a lead-in to margins that leave its trial room
+    closest = after_lead_in(request, best_effort=True)
+    assert closest.lead_in is not None
+    assert closest.stand_ins in str(caught.value)
+    assert closest.as_asked().limits.margins == limits["margins"]
 
 
 def test_commands_held_too_long_leave_no_room() -> None:
