@@ -9,7 +9,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from greybox.report.check_ties import mended_in_words, title_of
-from greybox.report.figures import BLACK, BLUE, VERMILION, new_figure, tidy
+from greybox.report.figures import (
+    BLACK,
+    BLUE,
+    VERMILION,
+    label_axes,
+    legend_above,
+    legend_outside,
+    new_figure,
+)
 from greybox.report.thinning import find_gaps, pick, thin
 from greybox.trial.checks.finding import Finding
 
@@ -43,19 +51,15 @@ def wind_figure(finding: Finding) -> Figure:
                 heading, air[::every, k], marker, color=colour, markersize=3, alpha=0.7,
                 label=f"to the {name}",
             )  # fmt: skip
-        left.set_title(f"{words}: scatter {scatter:.3g} m/s", fontsize=9)
-        left.set_ylabel("air over ground [m/s]", fontsize=9)
+        told = f"{words}: scatter {scatter:.3g} m/s"
+        label_axes(left, y="air over ground [m/s]", title=told)
         left.set_xlim(0, 360)
         left.set_xticks(range(0, 361, 45))
         right.plot(air[::every, 1], air[::every, 0], ".", color=BLUE, markersize=2.5, alpha=0.6)
         right.set_aspect("equal")
-        right.set_ylabel("north [m/s]", fontsize=9)
-        right.set_xlabel("east [m/s]", fontsize=9)
+        label_axes(right, "east [m/s]", "north [m/s]")
         reach = max(reach, 1.1 * float(np.quantile(np.abs(air), 0.999)))
         rounds.append(right)
-        for ax in (left, right):
-            ax.tick_params(labelsize=8)
-            tidy(ax)
     for ax in rounds:
         ax.set_xlim(-reach, reach)
         ax.set_ylim(-reach, reach)
@@ -68,14 +72,7 @@ def wind_figure(finding: Finding) -> Figure:
         ax.set_ylim(low, high)
     levels[0].tick_params(labelbottom=False)
     levels[-1].set_xlabel("heading [deg]", fontsize=9)
-    levels[0].legend(
-        fontsize=8,
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        frameon=False,
-        markerscale=2,
-        ncols=2,
-    )
+    legend_above(levels[0], side="right", columns=2, markerscale=2)
     figure.suptitle(f"{title_of(finding)}: the true wind must not turn with the ship", fontsize=11)
     return figure
 
@@ -108,14 +105,8 @@ def course_figure(finding: Finding) -> Figure:
     ax.axhline(0, color=BLACK, linewidth=0.8)
     ax.set_ylim(-185, 185)
     ax.set_yticks(range(-180, 181, 45))
-    ax.set_xlabel("time [s]", fontsize=9)
-    ax.set_ylabel("course − heading [deg], starboard positive", fontsize=9)
-    ax.legend(
-        fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False, ncols=2,
-        markerscale=3,
-    )  # fmt: skip
-    ax.tick_params(labelsize=8)
-    tidy(ax)
+    label_axes(ax, "time [s]", "course − heading [deg], starboard positive")
+    legend_above(ax, columns=2, markerscale=3)
     polar.set_theta_zero_location("N")
     polar.set_theta_direction(-1)
     polar.set_thetagrids(
@@ -164,18 +155,15 @@ def answer_figure(finding: Finding) -> Figure:
                 pick(t[part], index), pick(value[part], index), style, color=colour,
                 linewidth=1.2, label=name,
             )  # fmt: skip
-        left.set_title(f"{words}: correlation {match:+.2f}", fontsize=9)
-        left.set_ylabel(f"{word} acceleration [{unit}]", fontsize=9)
+        told = f"{words}: correlation {match:+.2f}"
+        label_axes(left, y=f"{word} acceleration [{unit}]", title=told)
         every = max(1, len(t) // _DOTS)
         right.plot(
             gain * p[key][::every], measured[::every], ".", markersize=3, color=BLUE,
             alpha=0.6,
         )  # fmt: skip
-        right.set_ylabel(f"measured [{unit}]", fontsize=9)
+        label_axes(right, y=f"measured [{unit}]")
         scatters.append(right)
-        for ax in (left, right):
-            ax.tick_params(labelsize=8)
-            tidy(ax)
     reach = 1.1 * float(np.quantile(np.abs(measured), 0.995))
     for ax in scatters:
         ax.axline((0, 0), slope=1, color=BLACK, linewidth=0.8, linestyle=":")
@@ -185,10 +173,7 @@ def answer_figure(finding: Finding) -> Figure:
     scatters[1].set_xlabel(f"pushed [{unit}]", fontsize=9)
     figure.axes[0].tick_params(labelbottom=False)
     figure.axes[2].set_xlabel("time [s]", fontsize=9)
-    figure.legend(
-        *figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2,
-        fontsize=9, frameon=False,
-    )  # fmt: skip
+    legend_outside(figure, figure.axes[0], "lower center", 2, fontsize=9)
     figure.suptitle(
         f"{title_of(finding)}: the ship must answer the way its thrusters push", fontsize=11
     )

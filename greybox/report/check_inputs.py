@@ -6,7 +6,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from greybox.report.check_ties import title_of
-from greybox.report.figures import BLACK, BLUE, GREEN, VERMILION, new_figure, tidy
+from greybox.report.figures import (
+    BLACK,
+    BLUE,
+    GREEN,
+    VERMILION,
+    label_axes,
+    legend_above,
+    new_figure,
+    tidy,
+)
 from greybox.trial.checks.finding import Finding
 
 _POINTS = 1500
@@ -27,7 +36,7 @@ def actuator_figure(finding: Finding) -> Figure:
         ax.plot(picture["t"], value, style, color=colour, markersize=3, linewidth=1.1, label=name)
     ax.set_xlabel("time [s]", fontsize=9)
     ax.set_ylabel(f"{finding.channel} [{'deg' if angular else 'as logged'}]", fontsize=9)
-    ax.legend(fontsize=8, frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
+    legend_above(ax, side="right", columns=3)
     tidy(ax)
     figure.suptitle(title_of(finding), fontsize=11, x=0.02, ha="left")
     return figure
@@ -47,11 +56,8 @@ def force_figure(finding: Finding) -> Figure:
     below.plot(t[rows], size[rows] / max(float(size.max()), 1e-300), color=BLACK, linewidth=0.9)
     for ax in (above, below):
         ax.axvspan(begin, end, color=VERMILION, alpha=0.18, linewidth=0)
-        ax.tick_params(labelsize=8)
-        tidy(ax)
-    above.set_ylabel("speed gained beyond thrusters\nand damping [m/s]", fontsize=9)
-    above.legend(fontsize=8, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0))
-    below.set_ylabel("thrust over\nits largest", fontsize=9)
-    below.set_xlabel("time [s]", fontsize=9)
+    label_axes(above, y="speed gained beyond thrusters\nand damping [m/s]")
+    legend_above(above, side="right", columns=2)
+    label_axes(below, "time [s]", "thrust over\nits largest")
     figure.suptitle(title_of(finding), fontsize=11, x=0.02, ha="left")
     return figure

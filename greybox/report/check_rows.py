@@ -9,7 +9,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from greybox.report.figures import BLACK, BLUE, GREEN, LABELS, VERMILION, new_figure, tidy
+from greybox.report.figures import (
+    BLACK,
+    BLUE,
+    GREEN,
+    LABELS,
+    VERMILION,
+    label_axes,
+    legend_above,
+    new_figure,
+    tidy,
+)
 from greybox.report.thinning import find_gaps, pick, thin
 from greybox.trial.checks.finding import Finding
 from greybox.trial.checks.signal_quality import MOTION
@@ -62,9 +72,8 @@ def gap_figure(finding: Finding, recording: Recording) -> Figure:
     wide = steps > finding.picture["limit"]
     third.semilogy(times[:-1][wide], steps[wide], "v", color=VERMILION, markersize=5)
     third.axhline(finding.picture["limit"], color=BLACK, linewidth=0.8, linestyle="--")
-    third.set_title("time to the next sample; above the dashed line it is a gap", fontsize=9)
-    third.set_ylabel("step [s]", fontsize=9)
-    third.set_xlabel("time [s]", fontsize=9)
+    told = "time to the next sample; above the dashed line it is a gap"
+    label_axes(third, "time [s]", "step [s]", told)
     _name(s, whole, zoom)
     return figure
 
@@ -85,8 +94,7 @@ def order_figure(finding: Finding) -> Figure:
             ax.plot(rows[part], t[part], ".", color=BLUE, markersize=4)
         inside = inside[:_MOST_MARKS]
         ax.plot(rows[inside], t[inside], "v", color=VERMILION, markersize=6, label="wrong time")
-        ax.set_ylabel("time [s]", fontsize=9)
-        ax.set_xlabel("row of the file", fontsize=9)
+        label_axes(ax, "row of the file", "time [s]")
     zoom.set_title(f"around the first, row {wrong[0] + 1}", fontsize=9)
     steps = np.diff(t)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
@@ -94,9 +102,8 @@ def order_figure(finding: Finding) -> Figure:
     third.plot(rows[wrong], steps[wrong - 1], "v", color=VERMILION, markersize=5)
     third.axhline(0, color=BLACK, linewidth=0.8, linestyle="--")
     third.set_yscale("symlog", linthresh=usual)
-    third.set_title("time since the row before; it must be above zero", fontsize=9)
-    third.set_ylabel("step [s]", fontsize=9)
-    third.set_xlabel("row of the file", fontsize=9)
+    told = "time since the row before; it must be above zero"
+    label_axes(third, "row of the file", "step [s]", told)
     _legend(whole)
     return figure
 
@@ -112,8 +119,7 @@ def fractions_figure(finding: Finding) -> Figure:
         ax.vlines(meant[part], 0.0, late, color=BLACK, linewidth=0.6)
         ax.plot(meant[part], late, "v", color=VERMILION, markersize=5, label="as written")
         ax.plot(meant[part], 0 * late, ".", color=BLUE, markersize=5, label="as meant")
-        ax.set_ylabel("late [s]", fontsize=9)
-        ax.set_xlabel("time [s]", fontsize=9)
+        label_axes(ax, "time [s]", "late [s]")
     zoom.set_title(f"around the first, t = {meant[0]:.6g} s", fontsize=9)
     _legend(whole)
     return figure
@@ -163,22 +169,14 @@ def spike_figure(finding: Finding) -> Figure:
     zoom.plot(t[part], value[part], ".", color=BLUE, markersize=4)
     near = spikes[(spikes >= part.start) & (spikes < part.stop)]
     for ax, marked in ((whole, spikes[:_MOST_MARKS]), (zoom, near)):
-        ax.plot(
-            t[marked], value[marked], "o", markersize=8, markerfacecolor="none",
-            markeredgecolor=VERMILION, markeredgewidth=1.4, label="outlier",
-        )  # fmt: skip
+        _circle(ax, t[marked], value[marked], "outlier", size=8)
     zoom.set_title(f"the largest: {size:.3g} {finding.unit} from its neighbours", fontsize=9)
     # on a slope an outlier shows only against what its neighbours predict
     third.plot(t[part], distance[part], ".-", color=BLUE, linewidth=0.8, markersize=4)
-    third.plot(
-        t[near], distance[near], "o", markersize=8, markerfacecolor="none",
-        markeredgecolor=VERMILION, markeredgewidth=1.4,
-    )  # fmt: skip
-    third.set_title("distance from what the neighbours predict", fontsize=9)
-    third.set_ylabel(f"distance [{finding.unit}]", fontsize=9)
-    third.set_xlabel("time [s]", fontsize=9)
-    _label(whole, finding)
-    _label(zoom, finding)
+    _circle(third, t[near], distance[near], size=8)
+    told = "distance from what the neighbours predict"
+    label_axes(third, "time [s]", f"distance [{finding.unit}]", told)
+    _name(finding, whole, zoom)
     _legend(whole)
     return figure
 
@@ -196,10 +194,7 @@ def wrap_figure(finding: Finding) -> Figure:
     zoom.plot(t[part], value[part], ".-", color=BLUE, linewidth=0.8, markersize=4)
     near = between[(between >= part.start) & (between < part.stop)]
     for ax, marked in ((whole, between[:_MOST_MARKS]), (zoom, near)):
-        ax.plot(
-            t[marked], value[marked], "o", markersize=7, markerfacecolor="none",
-            markeredgecolor=VERMILION, markeredgewidth=1.4, label="between the sides",
-        )  # fmt: skip
+        _circle(ax, t[marked], value[marked], "between the sides")
     zoom.set_title(f"closer, around t = {t[between[0]]:.6g} s", fontsize=9)
     kept = np.setdiff1d(np.arange(part.start, part.stop), near)
     third.plot(
@@ -208,8 +203,7 @@ def wrap_figure(finding: Finding) -> Figure:
     )  # fmt: skip
     third.set_title("without those samples, unwrapped", fontsize=9)
     for ax in (whole, zoom, third):
-        ax.set_ylabel("heading psi [deg]", fontsize=9)
-        ax.set_xlabel("time [s]", fontsize=9)
+        label_axes(ax, "time [s]", "heading psi [deg]")
     _legend(whole)
     return figure
 
@@ -227,20 +221,15 @@ def hold_figure(finding: Finding) -> Figure:
     _draw(whole, t, value)
     zoom.plot(t[part], value[part], ".-", color=BLUE, linewidth=0.8, markersize=4)
     for ax, marked in ((whole, held[:_MOST_MARKS]), (zoom, near)):
-        ax.plot(
-            t[marked], value[marked], "o", markersize=7, markerfacecolor="none",
-            markeredgecolor=VERMILION, markeredgewidth=1.4, label="repeated",
-        )  # fmt: skip
-        ax.set_ylabel(label_of(name, "m"), fontsize=9)
-        ax.set_xlabel("time [s]", fontsize=9)
+        _circle(ax, t[marked], value[marked], "repeated")
+        label_axes(ax, "time [s]", label_of(name, "m"))
     zoom.set_title("most repeated in a row", fontsize=9)
     way = np.hypot(np.diff(finding.picture["x_n"]), np.diff(finding.picture["y_n"]))
     rows = np.arange(max(part.start, 1), part.stop)
     third.plot(t[rows], way[rows - 1], ".-", color=BLUE, linewidth=0.8, markersize=4)
     third.plot(t[near], way[near - 1], "v", color=VERMILION, markersize=5)
-    third.set_title("way since the sample before: none, then all at once", fontsize=9)
-    third.set_ylabel("way [m]", fontsize=9)
-    third.set_xlabel("time [s]", fontsize=9)
+    told = "way since the sample before: none, then all at once"
+    label_axes(third, "time [s]", "way [m]", told)
     _legend(whole)
     return figure
 
@@ -259,8 +248,7 @@ def jump_figure(finding: Finding) -> Figure:
     zoom.plot(t[part], value[part], ".-", color=BLUE, linewidth=0.8, markersize=4)
     for ax in (whole, zoom):
         ax.axvline(after, color=VERMILION, linewidth=1.0, label="cut here")
-        ax.set_ylabel(label_of(name, "m"), fontsize=9)
-        ax.set_xlabel("time [s]", fontsize=9)
+        label_axes(ax, "time [s]", label_of(name, "m"))
     zoom.set_title(f"closer: a step of {np.hypot(*size):.3g} m", fontsize=9)
     for rows, colour, when in (
         (slice(part.start, k), BLUE, "before"),
@@ -271,9 +259,7 @@ def jump_figure(finding: Finding) -> Figure:
             linewidth=0.8, markersize=4, label=when,
         )  # fmt: skip
     third.set_aspect("equal", adjustable="datalim")
-    third.set_title("the track, before and after", fontsize=9)
-    third.set_xlabel("east [m]", fontsize=9)
-    third.set_ylabel("north [m]", fontsize=9)
+    label_axes(third, "east [m]", "north [m]", "the track, before and after")
     _legend(whole)
     third.legend(fontsize=8, frameon=False)
     return figure
@@ -294,14 +280,12 @@ def stuck_figure(finding: Finding, recording: Recording) -> Figure:
     if other is not None:
         _draw_part(third, *_orderly(other), low, high)
         third.set_xlim(zoom.get_xlim())
-        third.set_ylabel(label_of(other.name, other.unit), fontsize=9)
-        third.set_xlabel("time [s]", fontsize=9)
         third.set_title(f"meanwhile {other.name} moves", fontsize=9)
+        _name(other, third)
         axes.append(third)
     for ax in axes:
         _shade(ax, [(start, stop)], "stuck" if ax is whole else "")
-    _label(whole, finding)
-    _label(zoom, finding)
+    _name(finding, whole, zoom)
     return figure
 
 
@@ -330,11 +314,10 @@ def coarse_figure(finding: Finding) -> Figure:
     share = [100 * float(np.mean(change == k)) for k in sizes]
     third.bar(sizes, share, color=[VERMILION, *[BLUE] * (len(sizes) - 1)], width=0.7)
     third.set_xticks(sizes)
-    third.set_xlabel(f"change between samples [steps of {step:.4g} {finding.unit}]", fontsize=9)
-    third.set_ylabel("share of samples [%]", fontsize=9)
-    third.set_title(f"{share[0]:.0f} % of the samples repeat the one before", fontsize=9)
-    _label(whole, finding)
-    _label(zoom, finding)
+    size = f"change between samples [steps of {step:.4g} {finding.unit}]"
+    told = f"{share[0]:.0f} % of the samples repeat the one before"
+    label_axes(third, size, "share of samples [%]", told)
+    _name(finding, whole, zoom)
     return figure
 
 
@@ -351,14 +334,8 @@ def range_figure(finding: Finding) -> Figure:
         (above, value, "as logged"),
         (below, value * factor, f"multiplied by {factor:.5g}"),
     ):
-        ax.axhspan(
-            -limit,
-            limit,
-            color=GREEN,
-            alpha=0.15,
-            linewidth=0,
-            label=f"possible in rad (within {limit:.3g})",
-        )
+        told = f"possible in rad (within {limit:.3g})"
+        ax.axhspan(-limit, limit, color=GREEN, alpha=0.15, linewidth=0, label=told)
         _draw(ax, t[keep], x[keep])
         ax.set_title(title, fontsize=9, loc="left")
         ax.set_ylabel(f"{finding.channel} [rad]", fontsize=9)
@@ -367,9 +344,7 @@ def range_figure(finding: Finding) -> Figure:
     below.set_ylim(low - room, high + room)
     above.set_xlabel("")
     above.tick_params(labelbottom=False)
-    above.legend(
-        fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False, borderaxespad=0.2
-    )
+    legend_above(above, side="right", borderaxespad=0.2)
     figure.suptitle(f"Unit of {finding.channel}", fontsize=11)
     return figure
 
@@ -398,10 +373,8 @@ def _axes(title: str, three: bool = False) -> tuple[Figure, Any, Any, Any]:
     whole = figure.add_subplot(grid[0, :])
     zoom = figure.add_subplot(grid[1, 0] if three else grid[1, :])
     third = figure.add_subplot(grid[1, 1]) if three else None
-    for ax in (whole, zoom, third):
-        if ax is not None:
-            tidy(ax)
-            ax.tick_params(labelsize=8)
+    for ax in filter(None, (whole, zoom, third)):
+        label_axes(ax)
     figure.suptitle(title, fontsize=11)
     return figure, whole, zoom, third
 
@@ -480,21 +453,20 @@ def _shade(ax: Any, spans: Iterable[tuple[float, float]], label: str = "gap") ->
 
 
 def _legend(ax: Any) -> None:
-    ax.legend(
-        fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False,
-        borderaxespad=0.2, ncols=3,
+    legend_above(ax, side="right", columns=3, borderaxespad=0.2)
+
+
+def _circle(ax: Any, t: Array, value: Array, label: str = "", size: float = 7) -> None:
+    ax.plot(
+        t, value, "o", markersize=size, markerfacecolor="none", markeredgecolor=VERMILION,
+        markeredgewidth=1.4, label=label or None,
     )  # fmt: skip
 
 
-def _name(s: Signal, *axes: Any) -> None:
+def _name(of: Signal | Finding, *axes: Any) -> None:
+    name = of.name if isinstance(of, Signal) else of.channel
     for ax in axes:
-        ax.set_ylabel(label_of(s.name, s.unit), fontsize=9)
-        ax.set_xlabel("time [s]", fontsize=9)
-
-
-def _label(ax: Any, finding: Finding) -> None:
-    ax.set_ylabel(label_of(finding.channel, finding.unit), fontsize=9)
-    ax.set_xlabel("time [s]", fontsize=9)
+        label_axes(ax, "time [s]", label_of(name, of.unit))
 
 
 def _telling(recording: Recording, names: Sequence[str]) -> Signal:

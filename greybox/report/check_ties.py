@@ -25,7 +25,17 @@ from greybox.report.agreement import (
     smoothed,
 )
 from greybox.report.check_rows import label_of
-from greybox.report.figures import BLACK, BLUE, GREEN, ORANGE, VERMILION, new_figure, tidy
+from greybox.report.figures import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILION,
+    label_axes,
+    legend_above,
+    legend_outside,
+    new_figure,
+)
 from greybox.report.thinning import find_gaps, pick, thin
 from greybox.trial.checks.finding import CheckReport, Finding
 from greybox.trial.checks.motion import NAMES, Motion, make_motion
@@ -185,9 +195,7 @@ def tie_figure(finding: Finding, tie: Tie) -> Figure:
     for j, name in enumerate(names):
         pair = [figure.add_subplot(grid[i, j]) for i in (0, 1)]
         _draw_pair(pair, finding, tie, name, span)
-    first = figure.axes[0]
-    handles, labels = first.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+    legend_outside(figure, figure.axes[0], "lower center", 3, fontsize=9)
     if finding.id == "clock_offset":
         _draw_curve(figure.add_subplot(grid[:, columns]), finding, tie)
     elif finding.id == "lever_arm":
@@ -308,11 +316,9 @@ def _draw_pair(
                 pick(t[inside], index), pick(shown, index), style, color=colour, linewidth=1.3,
                 label=text,
             )  # fmt: skip
-        ax.set_title(f"{words}:\n{agreement.rms(name):.3g} {_UNITS[name]} apart (RMS)", fontsize=9)
+        title = f"{words}:\n{agreement.rms(name):.3g} {_UNITS[name]} apart (RMS)"
+        label_axes(ax, y=label_of(name, None), title=title)
         ax.set_xlim(*span)
-        ax.set_ylabel(label_of(name, None), fontsize=9)
-        ax.tick_params(labelsize=8)
-        tidy(ax)
         limits.append(ax.get_ylim())
     (a, b), (c, d) = limits
     # one scale shows the gain, unless it would flatten one of them
@@ -350,14 +356,9 @@ def _draw_curve(ax: Any, finding: Finding, tie: Tie) -> None:
     ax.axvline(value, color=VERMILION, linewidth=1.2, label=signed(f"estimate {value:+.2f} s"))
     ax.axvline(0, color=BLACK, linewidth=0.8, linestyle=":")
     ax.set_ylim(bottom=0)
-    ax.set_xlabel(f"{', '.join(finding.channels)} taken to be late by [s]", fontsize=9)
-    ax.set_ylabel("disagreement [% of that as logged]", fontsize=9)
-    ax.tick_params(labelsize=8)
-    tidy(ax)
-    ax.legend(
-        fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False,
-        columnspacing=1.0, handlelength=1.6,
-    )  # fmt: skip
+    late = f"{', '.join(finding.channels)} taken to be late by [s]"
+    label_axes(ax, late, "disagreement [% of that as logged]")
+    legend_above(ax, side="center", columns=2, columnspacing=1.0, handlelength=1.6)
 
 
 def _draw_slopes(cells: Sequence[Sequence[Any]], finding: Finding, tie: Tie) -> None:
@@ -383,9 +384,7 @@ def _draw_slopes(cells: Sequence[Sequence[Any]], finding: Finding, tie: Tie) -> 
             ax.plot(ends, slope * ends, color=VERMILION, linewidth=1.3)
             length = slope if name == "v" else -slope
             ax.set_title(signed(f"{words}; line: arm\n{length:+.2f} m {said}"), fontsize=9)
-            ax.set_ylabel(f"{name} from positions − logged [m/s]", fontsize=8)
-            ax.tick_params(labelsize=8)
-            tidy(ax)
+            label_axes(ax, y=f"{name} from positions − logged [m/s]", size=8)
     for j in (0, 1):
         low = min(cells[i][j].get_ylim()[0] for i in (0, 1))
         high = max(cells[i][j].get_ylim()[1] for i in (0, 1))
@@ -423,11 +422,6 @@ def _draw_angles(ax: Any, finding: Finding, tie: Tie) -> None:
     ax.set_ylim(ends[0] - beyond, ends[1] + beyond)
     ax.set_xlim(0, 360)
     ax.set_xticks(range(0, 361, 90))
-    ax.set_xlabel("heading [deg]", fontsize=9)
-    ax.set_ylabel("direction of u, v and ψ − direction of the track [deg]", fontsize=9)
-    ax.tick_params(labelsize=8)
-    tidy(ax)
-    ax.legend(
-        fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False,
-        columnspacing=1.0, handletextpad=0.3, markerscale=3,
-    )  # fmt: skip
+    label_axes(ax, "heading [deg]", "direction of u, v and ψ − direction of the track [deg]")
+    close: dict[str, float] = {"columnspacing": 1.0, "handletextpad": 0.3, "markerscale": 3}
+    legend_above(ax, side="center", columns=3, **close)

@@ -13,7 +13,17 @@ from numpy.typing import NDArray
 from greybox.diagnosis.result import Gain, Ranked, Runs
 from greybox.report.chart import Chart
 from greybox.report.error_profiles import Profile, profile
-from greybox.report.figures import BLACK, BLUE, LABELS, SKY, VERMILION, new_figure, tidy, to_svg
+from greybox.report.figures import (
+    BLACK,
+    BLUE,
+    LABELS,
+    SKY,
+    VERMILION,
+    label_axes,
+    legend_outside,
+    new_figure,
+    to_svg,
+)
 from greybox.report.free_run_errors import REGIMES, Errors, simulated, simulations
 from greybox.report.page import Picture
 from greybox.report.thinning import find_gaps, pick, thin
@@ -73,13 +83,12 @@ def run_figure(run: Runs, points: int = _POINTS) -> Figure:
             _line(top, t, np.clip(x, low, high), gaps, points, style)
             _line(below, t, np.clip(measured - x, -spread, spread), gaps, points, style)
         below.axhline(0, color=BLACK, linewidth=0.6)
-        top.set_ylabel(_SHORT.get(state, state), fontsize=9)
         unit = _SHORT.get(state, "").partition("[")[2]
-        below.set_ylabel("error" + f"\n[{unit}" * bool(unit), fontsize=9)
+        label_axes(top, y=_SHORT.get(state, state))
+        label_axes(below, y="error" + f"\n[{unit}" * bool(unit))
         for ax in (top, below):
-            tidy(ax)
             ax.yaxis.set_major_locator(MaxNLocator(4 if ax is top else 3))
-            ax.tick_params(labelsize=8, labelbottom=ax is below and i == len(states) - 1)
+            ax.tick_params(labelbottom=ax is below and i == len(states) - 1)
         if i == 0:
             _legend(figure, top)
     below.set_xlabel("time from the first sample [s]", fontsize=9)
@@ -171,10 +180,8 @@ def _profiles(errors: Errors, group: Index, place: Array, step: float) -> tuple[
             )  # fmt: skip
         ax.axhline(0, color=BLACK, linewidth=0.7)
         _keep_in_view(ax, drawn)
-        ax.set_ylabel(_SHORT.get(state, state), fontsize=9)
+        label_axes(ax, y=_SHORT.get(state, state))
         ax.yaxis.set_major_locator(MaxNLocator(4))
-        ax.tick_params(labelsize=8)
-        tidy(ax)
     _legend(figure, axes[0], enough=2)
     return figure, axes
 
@@ -196,12 +203,9 @@ def _keep_in_view(ax: Any, drawn: Sequence[Profile]) -> None:
 
 def _legend(figure: Figure, ax: Any, *, enough: int = 1) -> None:
     """Put the legend above everything, where there are enough entries to need one."""
-    handles, labels = ax.get_legend_handles_labels()
-    if len(labels) >= enough:
-        figure.legend(
-            handles, labels, loc="outside upper left", ncols=3, fontsize=8.5, frameon=False,
-            handlelength=1.6, columnspacing=1.2,
-        )  # fmt: skip
+    if len(ax.get_legend_handles_labels()[1]) >= enough:
+        look = {"fontsize": 8.5, "handlelength": 1.6, "columnspacing": 1.2}
+        legend_outside(figure, ax, "upper left", 3, **look)
 
 
 def regime_figure(errors: Errors) -> Figure:
@@ -227,10 +231,8 @@ def regime_figure(errors: Errors) -> Figure:
                 hatch="//" if name == "before" else None, edgecolor="white", linewidth=0,
                 error_kw={"elinewidth": 0.9},
             )  # fmt: skip
-        ax.set_ylabel(_SHORT.get(state, state), fontsize=9)
+        label_axes(ax, y=_SHORT.get(state, state))
         ax.yaxis.set_major_locator(MaxNLocator(4))
-        ax.tick_params(labelsize=8)
-        tidy(ax)
         ax.set_ylim(bottom=0)
     total = len(errors.regime)
     axes[-1].set_xticks(
@@ -260,12 +262,10 @@ def gain_figure(gain: Mapping[str, Gain]) -> Figure:
             )  # fmt: skip
     ax.axvline(100, color=BLACK, linewidth=0.7)
     names = [LABELS.get(s, s).split(" [")[0] for s in gain]
+    label_axes(ax, "fit of the free run (6.12) [%], 100 is perfect")
     ax.set_yticks(range(len(gain)), names, fontsize=9)
     ax.set_ylim(len(gain) - 0.5, -0.5)
-    ax.set_xlabel("fit of the free run (6.12) [%], 100 is perfect", fontsize=9)
-    ax.tick_params(axis="x", labelsize=8)
     _legend(figure, ax)
-    tidy(ax)
     return figure
 
 
@@ -319,10 +319,8 @@ def ranking_figure(step: Sequence[Ranked], kept: Sequence[str]) -> Figure:
     for tick, row in zip(ax.get_yticklabels(), rows, strict=True):
         tick.set_fontweight("bold" if row.key in kept else "normal")
     ax.set_ylim(len(rows) - 0.5, -0.6)
-    ax.set_xlabel("fall of −2 log L", fontsize=9)
-    ax.tick_params(axis="x", labelsize=8)
+    label_axes(ax, "fall of −2 log L")
     _legend(figure, ax)
-    tidy(ax)
     return figure
 
 

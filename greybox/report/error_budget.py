@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from greybox.diagnosis.budget import SENSOR
 from greybox.diagnosis.result import BudgetPart, Diagnosis, is_split, told_share
-from greybox.report.figures import BLUE, LABELS, NAMES, ORANGE, new_figure, tidy
+from greybox.report.figures import BLUE, LABELS, NAMES, ORANGE, legend_outside, new_figure, tidy
 from greybox.report.page import Table
 from greybox.validation.fit import fit_percent
 
@@ -43,11 +43,7 @@ def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
     axes[0].set_yticks(places, [p.part for p in budget], fontsize=8.5)
     axes[0].set_ylim(len(budget) - 0.4, -0.6)
     figure.supxlabel("share of the squared error before the extension [%]", fontsize=9)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper left", ncols=3, fontsize=8, frameon=False,
-        handlelength=1.4, columnspacing=1.0,
-    )  # fmt: skip
+    legend_outside(figure, axes[0], "upper left", 3, handlelength=1.4, columnspacing=1.0)
     return figure
 
 

@@ -20,9 +20,10 @@ from greybox.report.figures import (
     ORANGE,
     SKY,
     VERMILION,
+    label_axes,
+    legend_outside,
     new_figure,
     shorten,
-    tidy,
 )
 
 Array = NDArray[np.float64]
@@ -93,10 +94,8 @@ def forest_figure(
     ax.set_yticks(range(len(labels)), labels, fontsize=8, parse_math=False)
     ax.set_ylim(len(labels) - 0.5, -0.5)
     ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:+.0f}" if v else "0"))
-    ax.set_xlabel("distance from the estimate [% of it], zero at −100 %", fontsize=8.5)
-    ax.tick_params(axis="x", labelsize=8)
+    label_axes(ax, "distance from the estimate [% of it], zero at −100 %", size=8.5)
     _legend(figure, ax, 3)
-    tidy(ax)
     return figure
 
 
@@ -124,10 +123,8 @@ def tried_figure(comparison: Comparison) -> Figure:
     labels = [shorten(r.label, _LABEL) for r in rows]
     ax.set_yticks(range(len(rows)), labels, fontsize=8, parse_math=False)
     ax.set_ylim(len(rows) - 0.5, -0.5)
-    ax.set_xlabel("free-run fit, mean over the channels [%]", fontsize=8.5)
-    ax.tick_params(axis="x", labelsize=8)
+    label_axes(ax, "free-run fit, mean over the channels [%]", size=8.5)
     _legend(figure, ax, 3)
-    tidy(ax)
     return figure
 
 
@@ -154,11 +151,10 @@ def residual_figure(
         if state in inputs:
             _correlogram(row[1], inputs[state])
         word = LABELS.get(state, state).split(" [")[0]
-        row[0].set_ylabel(f"{word}\ncorrelation", fontsize=8.5)
+        label_axes(row[0], y=f"{word}\ncorrelation", size=8.5)
+        label_axes(row[1])
         for ax in row:
-            ax.tick_params(labelsize=8)
             ax.yaxis.set_major_locator(MaxNLocator(4))
-            tidy(ax)
     for ax, title, below in zip(
         axes[0], ("residuals with themselves", "residuals with inputs"),
         ("samples between them", "samples since the input"), strict=True,
@@ -211,10 +207,7 @@ def visited_figure(states: Mapping[str, Array], margins: Mapping[str, float]) ->
         ax.axvline(0, color=BLACK, linewidth=1)
         if name in margins:
             ax.axvspan(-margins[name], margins[name], color=ORANGE, alpha=0.3, linewidth=0)
-        ax.set_xlabel(LABELS.get(name, name), fontsize=8.5)
-        ax.set_ylabel("% of time", fontsize=8.5)
-        ax.tick_params(labelsize=8)
-        tidy(ax)
+        label_axes(ax, LABELS.get(name, name), "% of time", size=8.5)
     return figure
 
 
@@ -236,10 +229,7 @@ def regimes_figure(u: Array, v: Array) -> Figure:
             transform=ax.transAxes, ha="right" if right else "left",
             va="top" if ahead else "bottom", fontsize=9,
         )  # fmt: skip
-    ax.set_xlabel(LABELS["v"], fontsize=9)
-    ax.set_ylabel(LABELS["u"], fontsize=9)
-    ax.tick_params(labelsize=8)
-    tidy(ax)
+    label_axes(ax, LABELS["v"], LABELS["u"])
     return figure
 
 
@@ -276,7 +266,4 @@ def correlation_figure(labels: Sequence[str], correlation: Array) -> Figure:
 
 
 def _legend(figure: Figure, ax: Any, columns: int) -> None:
-    handles, labels = ax.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper left", ncols=columns, fontsize=8.5, frameon=False
-    )
+    legend_outside(figure, ax, "upper left", columns, fontsize=8.5)

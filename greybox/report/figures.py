@@ -75,6 +75,35 @@ def tidy(axes: Any) -> None:
         axes.spines[side].set_visible(False)
 
 
+def label_axes(axes: Any, x: str = "", y: str = "", title: str = "", size: float = 9) -> None:
+    """Name what is given of one pair of axes, and apply the common look."""
+    if x:
+        axes.set_xlabel(x, fontsize=size)
+    if y:
+        axes.set_ylabel(y, fontsize=size)
+    if title:
+        axes.set_title(title, fontsize=size)
+    axes.tick_params(labelsize=8)
+    tidy(axes)
+
+
+def legend_above(axes: Any, *given: Any, side: str = "left", columns: int = 1, **look: Any) -> None:
+    """Put the legend of one pair of axes above it: of all that is drawn, or of what is given."""
+    place = {"left": 0.0, "center": 0.5, "right": 1.0}[side]
+    axes.legend(
+        *given, loc=f"lower {side}", bbox_to_anchor=(place, 1.0), ncols=columns, fontsize=8,
+        frameon=False, **look,
+    )  # fmt: skip
+
+
+def legend_outside(figure: Figure, axes: Any, place: str, columns: int, **look: Any) -> None:
+    """Put what one pair of axes shows into a legend beside all axes of the figure."""
+    figure.legend(
+        *axes.get_legend_handles_labels(), loc=f"outside {place}", ncols=columns, frameon=False,
+        **{"fontsize": 8, **look},
+    )  # fmt: skip
+
+
 def comparison_figure(
     names: Sequence[str],
     runs: Sequence[LogFit],
@@ -144,20 +173,11 @@ def comparison_figure(
         top.set_ylim(view)
         below.set_ylim(gap)
         below.axhline(0, color=BLACK, linewidth=0.6)
-        top.set_ylabel(LABELS.get(state, state), fontsize=9)
         unit = LABELS.get(state, "").partition("[")[2]
-        below.set_ylabel("difference" + f"\n[{unit}" * bool(unit), fontsize=8)
-        top.legend(
-            fontsize=8,
-            loc="lower left",
-            bbox_to_anchor=(0.0, 1.0),
-            borderaxespad=0.2,
-            ncols=columns,
-            frameon=False,
-        )
+        label_axes(top, y=LABELS.get(state, state))
+        label_axes(below, y="difference" + f"\n[{unit}" * bool(unit), size=8)
+        legend_above(top, columns=columns, borderaxespad=0.2)
         for axes in (top, below):
-            tidy(axes)
-            axes.tick_params(labelsize=8)
             axes.yaxis.set_major_locator(MaxNLocator(4 if axes is top else 3))
         top.tick_params(labelbottom=False)
         below.tick_params(labelbottom=i == len(states) - 1)
@@ -241,14 +261,7 @@ def fit_figure(
         axes[i].set_ylim(0, 105)
         tidy(axes[i])
     axes[-1].set_xlabel("N [samples]", fontsize=9)
-    figure.legend(
-        *axes[0].get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=6,
-        fontsize=8,
-        frameon=False,
-        columnspacing=1.0,
-    )
+    legend_outside(figure, axes[0], "lower center", 6, columnspacing=1.0)
     figure.suptitle(title, fontsize=11)
     return figure
 
@@ -318,7 +331,7 @@ def bias_figure(rows: Sequence[Any], title: str) -> Figure:
     ax.axhline(0, color=BLACK, linewidth=0.8)
     ax.set_xticks(position, [r.parameter for r in rows], rotation=40, ha="right", fontsize=8)
     ax.set_ylabel("error / published sd")
-    figure.legend(loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    legend_outside(figure, ax, "lower center", 2)
     tidy(ax)
     ax.set_title(title, fontsize=10)
     return figure

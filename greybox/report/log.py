@@ -18,10 +18,11 @@ from greybox.report.figures import (
     LEGEND_ROW,
     ORANGE,
     STYLES,
+    label_axes,
+    legend_above,
     legend_columns,
     new_figure,
     shorten,
-    tidy,
 )
 from greybox.report.thinning import find_gaps, longest, pick, thin
 from greybox.report.track import draw_track
@@ -208,9 +209,8 @@ def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock, points: int)
             _draw_direction(ax, panel, clock, min(points, _DOTS))
         else:
             _draw_lines(ax, panel, clock, points)
-        ax.set_ylabel(panel.label, fontsize=8)
-        ax.tick_params(labelsize=8, labelbottom=ax is axes[-1])
-        tidy(ax)
+        label_axes(ax, y=panel.label, size=8)
+        ax.tick_params(labelbottom=ax is axes[-1])
         # bars reach over the whole height whatever the values are
         across = ax.get_xaxis_transform()
         time = clock.time
@@ -236,18 +236,9 @@ def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock, points: int)
                 # the label of the axis names the only line
                 handles, labels = handles[1:], labels[1:]
             labels = [shorten(label, _LONGEST_LABEL) for label in labels]
-            ax.legend(
-                handles,
-                labels,
-                fontsize=8,
-                loc="lower left",
-                bbox_to_anchor=(0.0, 1.0),
-                borderaxespad=0.1,
-                ncols=legend_columns(labels, _PHONE),
-                frameon=False,
-                handlelength=1.6,
-                columnspacing=1.2,
-            )
+            look = {"borderaxespad": 0.1, "handlelength": 1.6, "columnspacing": 1.2}
+            columns = legend_columns(labels, _PHONE)
+            legend_above(ax, handles, labels, columns=columns, **look)
     if axes:
         axes[0].figure.align_ylabels(axes)
         axes[-1].set_xlabel(f"time from the first sample [{clock.unit}]", fontsize=9)

@@ -19,7 +19,15 @@ from greybox.prediction.result import (
     PredictedManoeuvre,
     verdict_line,
 )
-from greybox.report.figures import BLACK, BLUE, VERMILION, new_figure, tidy, to_svg
+from greybox.report.figures import (
+    BLACK,
+    BLUE,
+    VERMILION,
+    label_axes,
+    legend_above,
+    new_figure,
+    to_svg,
+)
 from greybox.report.next_steps import after_prediction
 from greybox.report.page import Page, Picture, Section, Table, computed
 from greybox.trial.manoeuvres import Compliance
@@ -205,11 +213,9 @@ def _histories(
         axes = figure.add_subplot(grid[i, 0], sharex=first)
         first = first or axes
         _history(axes, made, name, factor)
-        axes.set_ylabel(label, fontsize=9)
-        axes.tick_params(labelsize=8, labelbottom=i == len(panels) - 1)
-        if i == len(panels) - 1:
-            axes.set_xlabel("time from the order [s]", fontsize=9)
-        tidy(axes)
+        last = i == len(panels) - 1
+        label_axes(axes, "time from the order [s]" if last else "", label)
+        axes.tick_params(labelbottom=last)
     return figure
 
 
@@ -245,10 +251,6 @@ def _track(made: PredictedManoeuvre) -> Any:
     axes.plot(0, 0, "o", color=VERMILION, markersize=6, markeredgecolor="white", label="order")
     if made.kind == "turning":
         axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("to starboard of the approach [m]", fontsize=9)
-    axes.set_ylabel("along the approach [m]", fontsize=9)
-    axes.tick_params(labelsize=8)
-    axes.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.1,
-                ncols=4, frameon=False, columnspacing=1.2)  # fmt: skip
-    tidy(axes)
+    label_axes(axes, "to starboard of the approach [m]", "along the approach [m]")
+    legend_above(axes, columns=4, borderaxespad=0.1, columnspacing=1.2)
     return figure

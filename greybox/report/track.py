@@ -9,7 +9,16 @@ from matplotlib.collections import PolyCollection
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from greybox.report.figures import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, tidy
+from greybox.report.figures import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    SKY,
+    VERMILION,
+    label_axes,
+    legend_above,
+)
 from greybox.report.thinning import pick, thin
 from greybox.rotation import body_to_ned
 from greybox.trial.gaps import GAP
@@ -75,25 +84,14 @@ def draw_track(axes: Any, log: TrialLog, gaps: NDArray[np.intp], points: int) ->
             label=word,
         )
     handles, labels = axes.get_legend_handles_labels()
-    axes.legend(
-        [*handles, *shown],
-        [*labels, *[h.get_label() for h in shown]],
-        fontsize=8,
-        loc="lower left",
-        bbox_to_anchor=(0.0, 1.0),
-        borderaxespad=0.1,
-        ncols=2,
-        frameon=False,
-        columnspacing=1.2,
-    )
+    labels += [h.get_label() for h in shown]
+    look = {"borderaxespad": 0.1, "columnspacing": 1.2}
+    legend_above(axes, [*handles, *shown], labels, columns=2, **look)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("east [m]", fontsize=9)
-    axes.set_ylabel("north [m]", fontsize=9)
-    axes.tick_params(labelsize=8)
+    label_axes(axes, "east [m]", "north [m]")
     # an offset or a power of ten would stand under the legend
     axes.ticklabel_format(useOffset=False, style="plain")
     axes.margins(0.06)
-    tidy(axes)
 
 
 def even_times(t: Array, sample_time: float) -> tuple[float, NDArray[np.intp]]:
