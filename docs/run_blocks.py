@@ -21,7 +21,7 @@ from pathlib import Path
 
 SOURCES = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```console\n(.*?)^```", re.M | re.S)
-_NUMBER = re.compile(r"[-+−]?\b\d+(?:[.,]\d+)*(?:e[-+]?\d+)?")
+NUMBER = re.compile(r"[-+−]?\b\d+(?:[.,]\d+)*(?:e[-+]?\d+)?")
 _OUTER = "…"
 SECONDS = 900
 
@@ -84,7 +84,7 @@ def _scripts(name: str) -> list[Path]:
 
 def without_numbers(line: str) -> str:
     """Return a line with one sign for every number and one blank for all between words."""
-    return " ".join(_NUMBER.sub("#", line).split())
+    return " ".join(NUMBER.sub("#", line).split())
 
 
 def shown(step: Step, output: str) -> list[str]:
