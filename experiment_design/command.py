@@ -565,6 +565,7 @@ def _run_for_prediction(
         model,
         envelope=dict(_range(text, vessel) for text in options.envelope),
         kept_starts=options.trials if options.start is not None else int(ended),
+        best_effort=options.best_effort,
         workers=options.workers,
         sailed=sailed.motions if sailed is not None else (),
     )
@@ -596,13 +597,16 @@ def _run_for_causes(
             f"greybox diagnose: give --diagnosis D, the JSON of greybox diagnose --json D, or name "
             f"them, such as --causes current heading_bias."
         )
-    request = prepare_request(model, both_sides(_asked(options, model), model), vessel)
+    request = prepare_request(
+        model, both_sides(_asked(options, model), model), vessel, best_effort=options.best_effort
+    )
     found = design_for_causes(
         request,
         model,
         causes,
         envelope=dict(_range(text, vessel) for text in options.envelope),
         kept_start=options.start is not None,
+        best_effort=options.best_effort,
         workers=options.workers,
     )
     _deliver(options, found.design, found, request.of_both_sides, {}, found.headline())

@@ -18,9 +18,11 @@ from experiment_design.criteria.cause_power import (
 )
 from experiment_design.feasibility.checks import require_horizon
 from experiment_design.for_prediction import (
+    RANDOM_SETTINGS,
     command_ranges,
     described_plan,
     operating_envelope,
+    random_motions,
     started_in,
     tightened_search,
 )
@@ -236,6 +238,8 @@ class CauseDesign:
 
         return self.design.to_dict() | {
             "for": "causes",
+            "efficiency_of": f"noncentrality of the cause that is hardest to tell: that of this "
+            f"plan, over that of {RANDOM_SETTINGS}",
             "level": self.level,
             "causes": [
                 {
@@ -299,6 +303,11 @@ class CauseDesign:
                 name = f"{self.causes[j].id} or {self.causes[i].id}"
                 lines.append(f"  {name:<42}" + "".join(f"{x:>8}" for x in cells))
         lines += [f"expected: {_sizes(c)}" for c in self.causes if c.tested]
+        if (gain := self.design.efficiency_vs_random) is not None:
+            lines.append(
+                f"{gain:.2f} times the information on the cause that is hardest to tell that "
+                f"{RANDOM_SETTINGS} gives"
+            )
         if self.plan.power.min() < WANTED:
             lines.append(
                 f"Note: below {WANTED:g} the trial may leave the question open: lengthen it, widen "
@@ -326,6 +335,7 @@ def design_for_causes(
     *,
     envelope: Mapping[str, tuple[float, float]] | None = None,
     kept_start: bool = False,
+    best_effort: bool = False,
     workers: int | None = None,
 ) -> CauseDesign:
     """Design the trial that makes the least power over open causes largest.
@@ -344,6 +354,8 @@ def design_for_causes(
         Range of commands that the trial may use; see `command_ranges`.
     kept_start : bool
         Whether the trial starts as the request says; else on a straight course in the envelope.
+    best_effort : bool
+        Return the closest plan when limits cannot be kept.
     workers : int, optional
         Processes; by default one a processor. The result does not depend on it.
 
@@ -392,6 +404,7 @@ def design_for_causes(
     searches, keeping = tightened_search(request, campaign)
     design = described_plan(
         request, searches, keeping, kept_starts=int(kept_start), began=began,
+        best_effort=best_effort,
         certificate="a plan for causes has no bound to be measured against",
     )  # fmt: skip
 
@@ -400,7 +413,12 @@ def design_for_causes(
 
     best = searches[0].reference
     random = rollout.run(schedule.expand(problem.levels(best.unit))[None])
-    design = replace(design, notes=(*notes, *design.notes))
+    gain = float(np.exp(searches[0].candidate.value - best.value))
+    design = replace(
+        design,
+        notes=(*notes, *design.notes),
+        efficiency_vs_random=gain if random_motions(request, searches) else None,
+    )
     plan = power.report(rollout.run(design.commands[0][None]))
     return CauseDesign(design, power.causes, plan, reported(random), reported(usual), power.level)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 
 from experiment_design.after import log_moments
 from experiment_design.certificate.certificate import absent
-from experiment_design.design import described
+from experiment_design.constraints.limits import TOLERANCE, Circumstances, Limit
+from experiment_design.design import CLOSEST, described
 from experiment_design.excitation.rollout import Motion
-from experiment_design.feasibility.checks import require_horizon
+from experiment_design.feasibility.checks import missed_at_start, require_horizon, smallest_circle
 from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
     tighten,
 )
 from experiment_design.feasibility.least_violation import least_change
 from experiment_design.information.envelope import Envelope, build_envelope
-from experiment_design.optimise.campaign import random_campaign
 from experiment_design.optimise.envelope_search import (
+    PARTS,
+    RANDOM,
     EnvelopeSearch,
     search_envelope,
     usual_beginnings,
@@ -31,7 +33,7 @@ from experiment_design.optimise.lead_in import after_lead_in
 from experiment_design.optimise.search import assess
 from experiment_design.output.result import Design, PlanPart
 from experiment_design.request.exclusions import require_compatible
-from experiment_design.request.regimes import start_words
+from experiment_design.request.regimes import STEADY_SECONDS, start_words
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.diagnosis.result import finite
 from greybox.errors import InfeasibleError, UsageError
@@ -49,6 +51,8 @@ _TIGHTENINGS = 3
 _UNKNOWN_MISFIT, _DIAGNOSED = 0.3, "diagnosed"
 # deviations of its sensor within which the sign of sway is not known (A10)
 _CLOSE = 3.0
+# what a plan is compared with, in words
+RANDOM_SETTINGS = f"the best of {RANDOM} random sequences of settings of the operating envelope"
 # of the range of a speed in the prior's trial: what the plan may go beyond; slowest speed
 # ahead, as a share of the limit, where no trial has shown one
 _BEYOND, _SLOWEST = 0.1, 0.3
@@ -92,6 +96,8 @@ class PredictionDesign:
         """Return the fields for JSON: those of the design, and what is expected of predictions."""
         return self.design.to_dict() | {
             "for": "prediction",
+            "efficiency_of": f"mean squared error of predictions: that after {RANDOM_SETTINGS}, "
+            f"over that after this plan",
             "prediction": {
                 "error_by_noise": self.noise,
                 "error_by_misfit": self.misfit,
@@ -173,6 +179,10 @@ class PredictionDesign:
             )
         if self.design.keeping is not None:
             lines.append(self.design.keeping.sentence())
+        if (gain := self.design.efficiency_vs_random) is not None:
+            lines.append(
+                f"{RANDOM_SETTINGS} leaves {gain:.2f} times the mean squared error of predictions"
+            )
         lines += self.design.missed()
         return "\n".join([*lines, *[f"Note: {n}" for n in self.design.notes]])
 
@@ -296,6 +306,7 @@ def design_for_prediction(
     envelope: Mapping[str, tuple[float, float]] | None = None,
     kept_starts: int = 0,
     sailed: Sequence[Motion] = (),
+    best_effort: bool = False,
     workers: int | None = None,
 ) -> PredictionDesign:
     """Design the trial that leaves the least error of predictions over the operating envelope.
@@ -313,6 +324,8 @@ def design_for_prediction(
         in the envelope.
     sailed : sequence of Motion
         What has been sailed, as `sailed_trial` gives it: the plan covers what it has not.
+    best_effort : bool
+        Return the closest plan when limits cannot be kept.
     workers : int, optional
         Processes; by default one a processor. The result does not depend on it.
 
@@ -338,15 +351,21 @@ def design_for_prediction(
     states = request.structure.states
     asked = replace(started_in(request, found, kept_starts), misfit=found.misled)
     if kept_starts:
-        asked = after_lead_in(asked)
+        asked = after_lead_in(asked, best_effort=best_effort)
     before = log_moments(found, sailed)
     searches, keeping = tightened_search(asked, lambda r: _campaign(r, found, before, workers))
     design = described_plan(
-        asked, searches, keeping, kept_starts=kept_starts, began=began,
+        asked, searches, keeping, kept_starts=kept_starts, began=began, best_effort=best_effort,
         certificate="a plan for prediction has no bound to be measured against",
     )  # fmt: skip
     usual = usual_beginnings(found, asked.schedule.holds, asked.hold).shape[1]
     design = replace(design, parts=_parts(asked, design.parts, usual))
+    if rivals := random_motions(asked, searches):
+        errors = [
+            found.error_without_parts(trials[-1], before + log_moments(found, trials[:-1]), PARTS)
+            for trials in (rivals, random_motions(asked, searches, plan=True))
+        ]
+        design = replace(design, efficiency_vs_random=float((errors[0] / errors[1])[0]))
     known = before + log_moments(found, design.motions[1:])
     noise, unknown = found.errors(design.motions[0], known)
     missed = diagnosed_misfit(model) if level == _DIAGNOSED else {}
@@ -374,14 +393,54 @@ def design_for_prediction(
 
 
 def started_in(request: PreparedRequest, envelope: Envelope, kept: int) -> PreparedRequest:
-    """Return the request whose trials but the first few start on a course in the envelope."""
+    """Return the request whose trials but the first few start on a course in the envelope.
+
+    It is the fastest that the caps allow; where they allow none, trials start as they were
+    prepared.
+    """
     others = request.trials - kept
-    given = request.start_commands or (None,) * request.trials
-    return replace(
-        request,
-        starts=(*request.starts[:kept], *(envelope.rollout.start,) * others),
-        start_commands=(*given[:kept], *(envelope.begun,) * others),
-    )
+    if not others:
+        return request
+    problem = build_problem(request, request.trials - 1)
+    for start, commands in _courses(envelope):
+        if (missed_at_start(problem, start) > TOLERANCE).any():
+            continue
+        given = request.start_commands or (None,) * request.trials
+        return replace(
+            request,
+            starts=(*request.starts[:kept], *(start,) * others),
+            start_commands=(*given[:kept], *(commands,) * others),
+        )
+    return request
+
+
+def _courses(envelope: Envelope) -> Iterator[tuple[Array, Array]]:
+    """Yield states with heading (nx + 1,) on courses, and their commands (nc,), fastest first."""
+    yield envelope.rollout.start, envelope.begun
+    courses, rollout = envelope.settings[envelope.straight], envelope.rollout
+    samples = round(STEADY_SECONDS / rollout.sample_time)
+    motion = rollout.run(np.repeat(courses[:, None], samples, axis=1))
+    steady = motion.state[:, -1, : rollout.nx]
+    for i in np.argsort(-steady[:, 0], kind="stable"):
+        if motion.stable[i]:
+            yield np.append(steady[i], 0.0), courses[i]
+
+
+def random_motions(
+    request: PreparedRequest, searches: Sequence[EnvelopeSearch], *, plan: bool = False
+) -> list[Motion]:
+    """Return how the best random sequence of each search moves the ship, or its plan.
+
+    Empty where no random one keeps the limits.
+    """
+    if not plan and not all(s.kept for s in searches):
+        return []
+    motions = []
+    for t, search in enumerate(searches):
+        problem = build_problem(request, t)
+        unit = (search.candidate if plan else search.reference).unit
+        motions.append(problem.scenarios[0].rollout.run(problem.commands(unit)[None]))
+    return motions
 
 
 def _of_start(request: PreparedRequest, kept: int) -> tuple[str, ...]:
@@ -412,6 +471,7 @@ def described_plan(
     kept_starts: int,
     began: float,
     certificate: str,
+    best_effort: bool = False,
 ) -> Design:
     """Return the design that searches over settings of an envelope found.
 
@@ -428,33 +488,54 @@ def described_plan(
         When the work began, by `time.perf_counter`.
     certificate : str
         Why there is no bound.
+    best_effort : bool
+        Return a plan that misses a limit too.
 
     Raises
     ------
     InfeasibleError
         The best plan misses a limit.
     """
+    status, notes = "solved: exchange of settings of the operating envelope", []
     problems = [build_problem(request, t) for t in range(request.trials)]
     short = [
         change
         for p, search in zip(problems, searches, strict=True)
         for change in least_change(p, assess(p, search.candidate.unit[None])[0])
     ]
-    if short:
-        name, amount = max(short, key=lambda item: item[1] / item[0].scale)
-        raise InfeasibleError(
-            f"no plan was found that keeps the {name.words} of {name.bound:g} {name.unit}: the "
-            f"best misses it by {amount:.3g} {name.unit}. Widen it ({name.option}), or narrow "
-            f"--envelope."
-        )
-    reference, number = random_campaign(problems, request.seed)
-    return described(
-        request, problems, [s.candidate.unit for s in searches], reference, number,
-        certificate=absent(certificate), keeping=keeping,
-        status="solved: exchange of settings of the operating envelope",
-        notes=_of_start(request, kept_starts),
+    if short and request.out_of_reach is not None and all(x.of_regime for x, _ in short):
+        # what stands in for a margin is then what the plan keeps
+        for limit, amount in sorted(short, key=lambda item: item[1]):
+            request = replace(request, limits=limit.eased(request.limits, amount)[0])
+    elif short:
+        sentence = _lacking(request, *max(short, key=lambda item: item[1] / item[0].scale))
+        if not best_effort:
+            raise InfeasibleError(sentence)
+        status = CLOSEST
+        notes.append(sentence)
+    if (told := request.out_of_reach) is not None:
+        status = CLOSEST
+        notes += [told.sentence, f"this plan keeps {request.stand_ins} instead"]
+    design = described(
+        request, problems, [s.candidate.unit for s in searches], None, 0,
+        certificate=absent(certificate), keeping=keeping, status=status,
+        notes=(*notes, *_of_start(request, kept_starts)),
         evaluations=sum(s.evaluations for s in searches), began=began,
     )  # fmt: skip
+    return replace(design, random_kept=min(s.kept for s in searches))
+
+
+def _lacking(request: PreparedRequest, limit: Limit, amount: float) -> str:
+    """Return which limit no plan was found to keep, and what helps."""
+    if limit.of_regime:
+        said = (
+            f"no plan was found that keeps the {limit.phrase}: the best misses it by {amount:.3g} "
+            f"{limit.unit}. {limit.eased(request.limits, amount)[1]}, or shorten the trial."
+        )
+    else:
+        current = float(np.hypot(*request.d[:2]))
+        said = limit.advice(amount, Circumstances(current, lambda: smallest_circle(request)))
+    return f"{said} A narrower --envelope or a longer search (--effort) may help too."
 
 
 def tightened_search(

@@ -149,6 +149,8 @@ class Limit(ABC):
 
     bound: float
 
+    # whether it holds in the regime alone, and not on the way into it
+    of_regime: ClassVar[bool] = False
     # of the kind; its place among limits, and the field of `TrialLimits` that sets it
     name: ClassVar[str]
     order: ClassVar[int]
@@ -225,9 +227,6 @@ class Limit(ABC):
 
 class PathLimit(Limit):
     """A limit at each sample of a trial."""
-
-    # whether it holds in the regime alone, and not on the way into it
-    of_regime = False
 
     @property
     @abstractmethod

@@ -136,12 +136,18 @@ def missed_targets(
     ]
 
 
+def missed_at_start(problem: TrialProblem, begun: Array) -> Array:
+    """Return by how much states and heading (nx + 1,) miss each path limit, negative where kept."""
+    program = problem.scenarios[0].limits
+    start = np.zeros(program.nx + 3)
+    start[: program.nx + 1] = begun
+    return np.asarray(program.path_values(start[None])[:, 0])
+
+
 def require_start(problem: TrialProblem, request: PreparedRequest, trial: int) -> None:
     """Raise where the start itself breaks a limit."""
     program = problem.scenarios[0].limits
-    start = np.zeros(program.nx + 3)
-    start[: program.nx + 1] = request.starts[trial]
-    missed = program.path_values(start[None])[:, 0]
+    missed = missed_at_start(problem, request.starts[trial])
     for limit, m, more in zip(program.path_limits, missed, program.backoff, strict=True):
         if m - more > TOLERANCE:
             raise InfeasibleError(limit.start_advice(float(m)))
@@ -169,7 +175,7 @@ def feasible_or_reason(
     changes = least_change(problem, chosen)
     circumstances = Circumstances(
         float(np.hypot(*request.d[:2])),
-        lambda: _smallest_circle(request),
+        lambda: smallest_circle(request),
         _margins_within_reach(request, trial, chosen, changes),
     )
     limit, amount = changes[0]
@@ -219,7 +225,7 @@ def tells_enough(request: PreparedRequest) -> bool:
     return bool(2 * (share > _VAGUE).sum() <= share.size)
 
 
-def _smallest_circle(request: PreparedRequest) -> float | None:
+def smallest_circle(request: PreparedRequest) -> float | None:
     """Return the diameter of the smallest circle that keeps the regime [m], None without any."""
     steady = steady_motions(request)
     signs = np.ones(len(steady.x), bool)

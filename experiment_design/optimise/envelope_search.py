@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment_design.constraints.limits import UNIT_SCALE
+from experiment_design.constraints.limits import TOLERANCE, UNIT_SCALE
 from experiment_design.excitation.rollout import Motion
 from experiment_design.information.envelope import HOLDS, Envelope
 from experiment_design.optimise.search import Candidate, limit_scale, to_unit
@@ -30,7 +30,7 @@ RANDOM = 200
 _VALIDATION, _LONGEST_VALIDATION = 0.15, 1 / 3
 # parts of a trial: an estimate chooses its terms by leaving out each of as many in turn, and what
 # is left must tell what the part that is left out shows
-_PARTS = 4
+PARTS = 4
 _CHAINS, _KEPT, _TOGETHER, _ROUNDS = 4, 12, 64, 14
 # of the largest steady yaw rate: how hard the zig-zag turns, and how hard those that a trial may
 # begin with; time scales of each leg
@@ -53,13 +53,16 @@ class EnvelopeSearch:
     random : ndarray
         (R,) values of the random sequences, −inf where a run is unstable.
     reference : Candidate
-        The best of these.
+        The best of these, of those that keep the limits where some do.
+    kept : int
+        How many of these keep the limits.
     evaluations : int
     """
 
     candidate: Candidate
     random: Array
     reference: Candidate
+    kept: int
     evaluations: int
 
 
@@ -156,7 +159,7 @@ def search_envelope(
 
     def worth(motion: Motion) -> Array:
         with np.errstate(divide="ignore"):
-            return np.asarray(-0.5 * np.log(envelope.error_without_parts(motion, known, _PARTS)))
+            return np.asarray(-0.5 * np.log(envelope.error_without_parts(motion, known, PARTS)))
 
     hold = problem.schedule.hold * problem.schedule.sample_time
     return exchange_settings(
@@ -273,8 +276,10 @@ def exchange_settings(
     found = better(map_forked(chain, range(_CHAINS), workers=workers))
     values = np.array([c.value for _, c in random])
     # the sides and speeds that a sequence goes to are no limits of the trial
-    best, reference = (replace(c, missed=c.missed[:-1]) for _, c in (found[0], better(random)[0]))
-    return EnvelopeSearch(best, values, reference, RANDOM + _CHAINS * rounds * tries)
+    keeping = [(p, c) for p, c in random if (c.missed[:-1] <= TOLERANCE).all()]
+    rival = better(keeping or random)[0]
+    best, reference = (replace(c, missed=c.missed[:-1]) for _, c in (found[0], rival))
+    return EnvelopeSearch(best, values, reference, len(keeping), RANDOM + _CHAINS * rounds * tries)
 
 
 def one_sided(envelope: Envelope, motion: Motion) -> Array:

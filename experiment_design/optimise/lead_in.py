@@ -18,7 +18,7 @@ from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TOLERANCE, Limit, PathLimit
 from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.excitation.schedule import Schedule
-from experiment_design.feasibility.checks import tells_enough
+from experiment_design.feasibility.checks import missed_at_start, tells_enough
 from experiment_design.request.regimes import state_words
 from experiment_design.request.request import (
     LeadIn,
@@ -51,11 +51,9 @@ _RELAXED, _SHARES = (1.1, 1.5, 2.0, 3.0, 5.0), (0.95, 0.9, 0.8, 0.65, 0.4, 0.2)
 
 def short_of_margin(request: PreparedRequest) -> bool:
     """Whether the first trial's start misses margins and nothing else."""
-    program = build_problem(replace(request, backoff=())).scenarios[0].limits
-    start = np.zeros(program.nx + 3)
-    start[: program.nx + 1] = request.starts[0]
-    missed = program.path_values(start[None])[:, 0] > TOLERANCE
-    margins = program.of_regime
+    problem = build_problem(replace(request, backoff=()))
+    missed = missed_at_start(problem, request.starts[0]) > TOLERANCE
+    margins = problem.scenarios[0].limits.of_regime
     return bool((missed & margins).any() and not (missed & ~margins).any())
 
 

@@ -148,11 +148,6 @@ RULES = (
         "{option} says what predictions are wanted for", "use --for prediction with it",
     ),
     _beside(
-        "for prediction, for causes", "best_effort",
-        "{option} exchanges settings that hold the ship within her limits, and has no plan that "
-        "is closest to them", "leave out {other}, or use --for coefficients",
-    ),
-    _beside(
         "target", "criterion, want, of",
         "{option} makes the standard errors that it names small, and no others",
     ),

@@ -15,7 +15,8 @@ from greybox.errors import UsageError
 Array = NDArray[np.float64]
 Signs = tuple[tuple[str, int], ...]
 
-_SECONDS = 400.0
+# in which a ship settles to constant commands [s]
+STEADY_SECONDS = 400.0
 _MOST = 729
 
 
@@ -75,7 +76,7 @@ def steady_motions(request: PreparedRequest, start: Array | None = None) -> Stea
     grid = np.array(list(product(np.linspace(0, 1, levels), repeat=min(commands, 9))))[:_MOST]
     if commands > 9:
         grid = np.hstack([grid, np.full((len(grid), commands - 9), 0.5)])
-    samples = round(_SECONDS / schedule.sample_time)
+    samples = round(STEADY_SECONDS / schedule.sample_time)
     values = schedule.lower + (schedule.upper - schedule.lower) * grid
     rest = np.zeros(len(structure.states) + 1)
     rest[0] = 0.1

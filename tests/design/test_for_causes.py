@@ -198,6 +198,11 @@ def test_a_plan_tells_more_than_random_and_usual_trials(found) -> None:
     worst = found.plan.detectable_share.max()
     assert worst < found.random.detectable_share.max() < found.usual.detectable_share.max()
     told = found.to_dict()
+    # shares go with the square root of the noncentrality
+    ratio = found.random.detectable_share.max() / worst
+    assert told["efficiency_vs_random"] == pytest.approx(ratio**2)
+    assert told["efficiency_lower_bound"] is None
+    assert "noncentrality" in told["efficiency_of"]
     json.dumps(told["causes"], allow_nan=False)
     assert told["for"] == "causes"
     first = told["causes"][0]

@@ -10,7 +10,8 @@ import pytest
 from designs import limited_ship, make_request, ship_file, thesis_model
 
 from experiment_design import for_prediction
-from experiment_design.constraints.limits import TrialLimits
+from experiment_design.constraints.limits import Circle, TrialLimits
+from experiment_design.design import CLOSEST
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
 from experiment_design.for_prediction import (
@@ -18,6 +19,7 @@ from experiment_design.for_prediction import (
     design_for_prediction,
     diagnosed_misfit,
     prior_misfit,
+    started_in,
 )
 from experiment_design.information.envelope import _sensitivities, build_envelope
 from experiment_design.optimise.envelope_search import (
@@ -27,7 +29,7 @@ from experiment_design.optimise.envelope_search import (
     usual_manoeuvres,
 )
 from experiment_design.output.next_steps import after_design
-from experiment_design.request.request import build_problem
+from experiment_design.request.request import OutOfReach, build_problem
 from greybox.commands.main import main
 from greybox.errors import InfeasibleError, UsageError
 from greybox.model.model import ManoeuvringModel
@@ -255,6 +257,12 @@ def test_a_plan_leaves_less_than_random_sequences(found) -> None:
     assert told["for"] == "prediction"
     assert told["prediction"]["prior"] == "poor"
     assert json.dumps(told["prediction"])
+    # of the best of 200, which leave less than their median does
+    gain = told["efficiency_vs_random"]
+    assert 1 < gain < found.random**2
+    assert told["random_kept"] > 0
+    assert told["efficiency_of"].startswith("mean squared error of predictions")
+    assert f"leaves {gain:.2f} times the mean squared error" in found.summary()
     assert "poor" in found.headline()
     # commands stay in the envelope, the motion keeps way on
     commands = found.design.commands[0]
@@ -426,6 +434,44 @@ def test_options_that_do_not_go_together(files, options, message, capsys) -> Non
     assert main(asked) == 1
     assert message in capsys.readouterr().err
     assert not (files / "none.csv").exists()
+
+
+def test_a_trial_starts_on_the_fastest_course_that_its_cap_allows(envelope) -> None:
+    fast = started_in(request_of(), envelope, 0).starts[0]
+    np.testing.assert_allclose(fast, envelope.rollout.start)
+    cap = 0.8 * float(np.hypot(*fast[:2]))
+    slow = started_in(request_of(limits=TrialLimits(speed_cap=cap)), envelope, 0)
+    speed = float(np.hypot(*slow.starts[0][:2]))
+    assert 0.8 * cap < speed <= cap
+    held = np.repeat(slow.start_commands[0][None, None], 600, axis=1)
+    np.testing.assert_allclose(envelope.rollout.run(held).state[0, -1, :3], slow.starts[0][:3])
+
+
+def test_the_closest_plan_where_no_other_is_found(model) -> None:
+    room = TrialLimits(margins={"u": 0.2}, area=Circle(0.0, 0.0, 8.0))
+    request = request_of(duration=60.0, effort=0.01, limits=room)
+    with pytest.raises(InfeasibleError, match="the sea room is too small") as told:
+        design_for_prediction(request, model)
+    design = design_for_prediction(request, model, best_effort=True).design
+    assert design.status == CLOSEST
+    assert str(told.value) in design.notes
+    assert [x.name for x in design.broken] == ["sea room"]
+
+
+def test_the_closest_plan_to_a_margin_out_of_reach(model) -> None:
+    """It says which margin it keeps, and is held against the one that was asked for."""
+    told = OutOfReach(TrialLimits(margins={"u": 9.0}), None, "no motion keeps 9 m/s.")
+    # no plan goes to both sides at this speed
+    limits = TrialLimits(margins={"u": 2.1})
+    request = request_of(duration=60.0, effort=0.01, limits=limits, out_of_reach=told)
+    design = design_for_prediction(request, model, best_effort=True).design
+    assert design.status == CLOSEST
+    assert "no motion keeps 9 m/s." in design.notes
+    kept = design.margins["u"]
+    assert kept < 2.1
+    assert design.request.stand_ins == f"--margin-u {np.floor(1e3 * kept) / 1e3:g}"
+    (report,) = design.broken
+    assert report.missed == pytest.approx(9.0 - kept)
 
 
 def test_a_start_short_of_its_margins_is_led_in(model) -> None:

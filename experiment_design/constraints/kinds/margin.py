@@ -32,6 +32,11 @@ class FromZero(PathLimit):
     # what else helps where it cannot be kept
     otherwise = "choose another --regime"
 
+    def eased(self, limits: TrialLimits, more: float) -> tuple[TrialLimits, str]:
+        """Return limits with a lower margin."""
+        value = max(0.0, float(np.floor(1e3 * (self.bound - more)) / 1e3))
+        return self.with_bound(limits, value), f"Use {self.option} {value:g}"
+
     def advice(self, amount: float, circumstances: Circumstances) -> str:
         """Return which margin is within reach instead."""
         unit = f" {self.unit}"
