@@ -144,13 +144,8 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets, write_json
     from greybox.report.next_steps import after_import
     from greybox.trial.checks.check import require_each_once
-    from greybox.trial.import_files import (
-        LOG_SUFFIXES,
-        import_files,
-        is_folder,
-        raw_files,
-        targets,
-    )
+    from greybox.trial.import_files import import_files, is_folder, raw_files, targets
+    from greybox.trial.log_files import ENDINGS
     from greybox.trial.readers.formats import has_topics
     from greybox.trial.store import read_record, record_path
     from greybox.vessel.conditions import UNITS
@@ -170,7 +165,7 @@ def run(options: argparse.Namespace) -> None:
             f"or an MCAP file: name the bag, or leave --topic out."
         )
     folder = is_folder(raw, options.out)
-    if not folder and Path(options.out).suffix.lower() not in ("", *LOG_SUFFIXES):
+    if not folder and Path(options.out).suffix.lower() not in ("", *ENDINGS):
         raise UsageError(
             f"--out {options.out} ends in '{Path(options.out).suffix}': name a log that ends in "
             f".csv or .parquet."

@@ -12,6 +12,8 @@ from greybox.vessel.vessel import ActuatorKind
 # what differs from an ideal actuator: response [s] (or one sample), gain, and the gains between
 # which both columns can have one unit
 _RESPONSE, _GAIN_ERROR, _ONE_UNIT = 0.1, 0.02, (0.5, 2.0)
+# fields with an interval, in the order of a record
+_NUMBERS = ("delay", "time_constant", "response", "gain", "offset", "rate_limit", "dead_band")
 
 
 @dataclass(frozen=True)
@@ -147,21 +149,9 @@ class ActuatorEstimate:
 
         new = self.at_renewal
         return {
-            "thruster": self.thruster,
-            "kind": self.kind,
-            "command": self.command,
-            "feedback": self.feedback,
-            "unit": self.unit,
-            "delay": shown(self.delay),
-            "time_constant": shown(self.time_constant),
-            "response": shown(self.response),
-            "gain": shown(self.gain),
-            "offset": shown(self.offset),
-            "rate_limit": shown(self.rate_limit),
-            "dead_band": shown(self.dead_band),
-            "residual_std": self.residual_std,
-            "step": self.step,
-            "hold": self.hold,
+            **{n: getattr(self, n) for n in ("thruster", "kind", "command", "feedback", "unit")},
+            **{n: shown(getattr(self, n)) for n in _NUMBERS},
+            **{n: getattr(self, n) for n in ("residual_std", "step", "hold")},
             "delay_at_renewal": shown(new[0] if new else None),
             "time_constant_at_renewal": shown(new[1] if new else None),
             "logs": list(self.logs),

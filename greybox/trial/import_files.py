@@ -22,15 +22,12 @@ from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.two_pass_import import Stream, is_large
 from greybox.trial.log import Provenance, TrialLog
-from greybox.trial.log_files import find_logs
+from greybox.trial.log_files import ENDINGS, find_logs
 from greybox.trial.raw_log import Recording
 from greybox.trial.readers.formats import is_bag, open_raw
 from greybox.trial.repair import check_ids, repair
 from greybox.trial.store import record_path, write_log
 from greybox.vessel.vessel import Vessel
-
-# a log has one of these names; any other is a folder where several files are imported
-LOG_SUFFIXES = (".csv", ".parquet", ".pq")
 
 
 def raw_files(paths: Sequence[str]) -> list[str]:
@@ -126,7 +123,7 @@ def is_folder(paths: Sequence[str | Path], out: str | Path) -> bool:
     """Whether `out` names a folder: one that exists, ends in a slash, or has several files."""
     if Path(out).is_dir() or str(out).endswith(("/", os.sep)):
         return True
-    return len(paths) > 1 and Path(out).suffix.lower() not in LOG_SUFFIXES
+    return len(paths) > 1 and Path(out).suffix.lower() not in ENDINGS
 
 
 def targets(paths: Sequence[str | Path], out: str | Path) -> list[Path]:

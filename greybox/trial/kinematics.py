@@ -169,9 +169,11 @@ def carried_gaps(
         source = ("r",) if step.operation == "move_velocity" else step.source
         gaps = []
         for n in out.keys() & set(source):
-            # velocities are turned by the heading of the sample alone
-            turned = step.operation == "difference" and n == "psi" and "r" not in step.channels
-            reach = 0 if turned else _reach(step, sample_time)
+            # how many neighbours on either side are taken into a sample
+            reach = math.ceil(step.number("window") / (2 * sample_time))
+            if step.operation == "difference":
+                # velocities are turned by the heading of the sample alone
+                reach = int(n != "psi" or "r" in step.channels)
             gaps.append(binary_dilation(out[n], iterations=reach) if reach else out[n])
         if gaps:
             gap = np.any(gaps, axis=0)
@@ -182,13 +184,6 @@ def carried_gaps(
                 k = np.arange(len(out[name]))
                 out[name] = np.interp(k + late, k, out[name].astype(float)) > 0
     return {n: m for n, m in out.items() if m.any()}
-
-
-def _reach(step: Step, sample_time: float) -> int:
-    """Return how many neighbours on either side a step takes into a sample."""
-    if step.operation == "difference":
-        return 1
-    return math.ceil(step.number("window") / (2 * sample_time))
 
 
 class _TooShortError(LogError):

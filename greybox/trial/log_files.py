@@ -12,7 +12,8 @@ from typing import Any
 
 from greybox.errors import GreyboxError, LogError, UsageError
 
-# what a folder or a pattern is searched for: records and reports stand beside logs
+# what the names of logs end in, for which a folder is searched: records and reports stand beside
+# them
 ENDINGS = (".csv", ".parquet", ".pq")
 
 

@@ -9,16 +9,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 from greybox.trial.steps import RECORDED, Step, Value, finite_number
 
 _NUMBER = r"([-+.\deE]+)"
-_MADE_OF = {
-    "positions and heading": ("x_n", "y_n", "psi"),
-    "heading": ("psi",),
-}
 # operation, channels at least, and parameters of what each finding's mend was
 _MENDS: dict[str, tuple[str, Mapping[str, Value]]] = {
     "duplicate_time": ("order", {}), "nan": ("drop", {}), "outlier": ("drop", {}),
@@ -75,13 +72,18 @@ def _mend(sentence: str) -> Step:
 
 
 def _derived(sentence: str) -> Step:
-    for pattern, make in _PATTERNS:
-        match = pattern.fullmatch(sentence)
-        if match:
-            try:
-                return make(sentence, match)
-            except ValueError:
-                break
+    for pattern, operation, channels, source, names in _SENTENCES:
+        match = re.fullmatch(pattern, sentence)
+        if match is None:
+            continue
+        found = list(match.groups())
+        named = found.pop(0).split(", ") if channels is None else channels
+        with suppress(ValueError):
+            numbers = map(finite_number, found)
+            return _step(
+                sentence, operation, named, source, **dict(zip(names, numbers, strict=True))
+            )
+        break
     return _step(sentence, "recorded", ())
 
 
@@ -130,57 +132,27 @@ _REMOVED: dict[str, Callable[[Any, Any], Told]] = {
 }  # fmt: skip
 _STATED = re.compile(r"\[sensors\] (\w+) = (\S+): .*")
 _FIXED = re.compile(r"(\w+) of ([^:]+): ")
-_PATTERNS: tuple[tuple[re.Pattern[str], Callable[[str, re.Match[str]], Step]], ...] = (
-    (
-        re.compile(r"([urv](?:, [urv])*) from (positions and heading|heading) by central .*"),
-        lambda s, m: _step(s, "difference", m[1].split(", "), _MADE_OF[m[2]]),
-    ),
-    (
-        re.compile(rf"u, v from positions and heading by Savitzky-Golay over {_NUMBER} s"),
-        lambda s, m: _step(
-            s,
-            "local_polynomials",
-            ("u", "v"),
-            _MADE_OF["positions and heading"],
-            window=finite_number(m[1]),
-        ),
-    ),
-    (
-        re.compile(r"u, v from the velocity over ground and the heading"),
-        lambda s, m: _step(s, "earth_to_body", ("u", "v"), ("v_n", "v_e", "psi")),
-    ),
-    (
-        re.compile(r"u_q, v_q from (V_q, gamma_q|the apparent wind's speed and direction) .*"),
-        lambda s, m: _step(s, "polar", ("u_q", "v_q"), ("V_q",)),
-    ),
-    (
-        re.compile(r"u_q, v_q from the true wind, .*"),
-        lambda s, m: _step(s, "true_wind", ("u_q", "v_q"), ("psi", "u", "v")),
-    ),
-    (
-        re.compile(rf"u_q, v_q moved from the anemometer at \({_NUMBER}, {_NUMBER}\) m .*"),
-        lambda s, m: _step(
-            s, "move_anemometer", ("u_q", "v_q"), x=finite_number(m[1]), y=finite_number(m[2])
-        ),
-    ),
-    (
-        re.compile(rf"true wind brought from {_NUMBER} to {_NUMBER} m\b.*"),
-        lambda s, m: _step(
-            s,
-            "wind_height",
-            ("u_q", "v_q"),
-            measured=finite_number(m[1]),
-            height=finite_number(m[2]),
-        ),
-    ),
-    (
-        re.compile(rf"(\w+) smoothed over {_NUMBER} s \(local polynomials of order 2\)"),
-        lambda s, m: _step(s, "smooth", (m[1],), window=finite_number(m[2]), order=2.0),
-    ),
-    (
-        re.compile(rf"decimated from {_NUMBER} s to {_NUMBER} s"),
-        lambda s, m: _step(
-            s, "decimate", (), measured=finite_number(m[1]), sample_time=finite_number(m[2])
-        ),
-    ),
-)
+# sentence, operation, channels (None: those that it names first), what these were made of, and what
+# the numbers in it are
+_SENTENCES: tuple[
+    tuple[str, str, tuple[str, ...] | None, tuple[str, ...], tuple[str, ...]], ...
+] = (
+    (r"([urv](?:, [urv])*) from positions and heading by central .*",
+     "difference", None, ("x_n", "y_n", "psi"), ()),
+    (r"([urv](?:, [urv])*) from heading by central .*", "difference", None, ("psi",), ()),
+    (rf"u, v from positions and heading by Savitzky-Golay over {_NUMBER} s",
+     "local_polynomials", ("u", "v"), ("x_n", "y_n", "psi"), ("window",)),
+    (r"u, v from the velocity over ground and the heading",
+     "earth_to_body", ("u", "v"), ("v_n", "v_e", "psi"), ()),
+    (r"u_q, v_q from (?:V_q, gamma_q|the apparent wind's speed and direction) .*",
+     "polar", ("u_q", "v_q"), ("V_q",), ()),
+    (r"u_q, v_q from the true wind, .*", "true_wind", ("u_q", "v_q"), ("psi", "u", "v"), ()),
+    (rf"u_q, v_q moved from the anemometer at \({_NUMBER}, {_NUMBER}\) m .*",
+     "move_anemometer", ("u_q", "v_q"), (), ("x", "y")),
+    (rf"true wind brought from {_NUMBER} to {_NUMBER} m\b.*",
+     "wind_height", ("u_q", "v_q"), (), ("measured", "height")),
+    (rf"(\w+) smoothed over {_NUMBER} s \(local polynomials of order (2)\)",
+     "smooth", None, (), ("window", "order")),
+    (rf"decimated from {_NUMBER} s to {_NUMBER} s",
+     "decimate", (), (), ("measured", "sample_time")),
+)  # fmt: skip

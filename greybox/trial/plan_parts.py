@@ -17,7 +17,7 @@ from greybox.files import read_csv_rows
 from greybox.trial.convert.time_grid import MIN_SEGMENT
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import Array
-from greybox.trial.segments import join_segments, whole_name
+from greybox.trial.segments import join_segments, numbered, whole_name
 from greybox.vessel.vessel import Vessel
 
 Samples = NDArray[np.intp]
@@ -265,8 +265,8 @@ def by_parts(
                 if b - a >= MIN_SEGMENT and labels[a] in own:
                     own[labels[a]].append(log.window(a, b, log.name))
         # as segments between gaps are named, so that they count as one log
-        fit += _numbered(own[TRIAL], name)
-        judges += _numbered(own[VALIDATION], f"{name}, {VALIDATION}")
+        fit += numbered(own[TRIAL], name)
+        judges += numbered(own[VALIDATION], f"{name}, {VALIDATION}")
         told.append(SailedPlan(name, trial.name, shift, share, counts))
     if not fit:
         counted = ", ".join(f"{n} {k}" for s in told for k, n in s.samples.items())
@@ -275,12 +275,6 @@ def by_parts(
             f"plan (there are {counted}): leave out --plan to estimate on all."
         )
     return fit, judges, tuple(told)
-
-
-def _numbered(windows: list[TrialLog], name: str) -> list[TrialLog]:
-    if len(windows) == 1:
-        return [replace(windows[0], name=name)]
-    return [replace(w, name=f"{name}[{k + 1}]") for k, w in enumerate(windows)]
 
 
 def _nearest(

@@ -179,11 +179,6 @@ def _order(recording: Recording, step: Step) -> Recording:
     return _changed(recording, step.channels, in_order)
 
 
-def _cut(recording: Recording, step: Step) -> Recording:
-    """Return the recording as it is: its steps tell where it is cut."""
-    return recording
-
-
 def _signals_of(recording: Recording, step: Step) -> set[str]:
     """Return the signals that hold the channels of a step, or of which they are derived."""
     names: set[str] = set()
@@ -295,11 +290,13 @@ _MEASURED_AS = {
     "x_n": ("lat", "lon"), "y_n": ("lat", "lon"), "v_n": ("sog", "cog"), "v_e": ("sog", "cog"),
     "u_q": ("V_q", "gamma_q", "dir_q"), "v_q": ("V_q", "gamma_q", "dir_q"),
 }  # fmt: skip
-_ACTIONS = {
-    "order": _order, "drop": _drop, "interpolate": _interpolate, "cut": _cut, "scale": _scale,
+_ACTIONS: dict[str, Callable[[Recording, Step], Recording]] = {
+    "order": _order, "drop": _drop, "interpolate": _interpolate, "scale": _scale,
     "offset": _offset, "exchange": _exchange, "shift": _shift, "turn_heading": _turn_heading,
     "earth_to_body": _earth_to_body, "move_antenna": _move_antenna,
     "pad_fractions": _pad_fractions,
+    # the steps themselves tell where a recording is cut
+    "cut": lambda recording, step: recording,
 }  # fmt: skip
 # these act on positions and unwrapped headings
 _ON_DERIVED = frozenset({"earth_to_body", "move_antenna", "shift", "turn_heading"})

@@ -87,6 +87,13 @@ def whole_name(name: str) -> str:
     return _SEGMENT.sub("", name)
 
 
+def numbered(segments: Sequence[TrialLog], name: str) -> list[TrialLog]:
+    """Return segments by the name of their log, each with its number where there are several."""
+    if len(segments) == 1:
+        return [replace(segments[0], name=name)]
+    return [replace(s, name=f"{name}[{k + 1}]") for k, s in enumerate(segments)]
+
+
 def split_segments(log: TrialLog) -> list[TrialLog]:
     """Return the segments between the gaps of a log's time; the log itself where it has none."""
     found = split_at_gaps(log.t, log.sample_time)
@@ -225,24 +232,19 @@ def by_sign(
     for name, margin in margins.items():
         if margin < 0 or not math.isfinite(margin):
             raise LogError(f"the margin of {name} is {margin:g}, it cannot be negative.")
-    pieces = split_at_gaps(log.t, log.sample_time)
     made = []
-    for first, last in pieces:
+    for first, last in split_at_gaps(log.t, log.sample_time):
         signs = np.stack(
             [
                 _sign(log[name][first:last], margin, log.vessel.std(name))
                 for name, margin in margins.items()
             ]
         )
-        inside = (signs != 0).all(axis=0)
         changes = np.flatnonzero((np.diff(signs, axis=1) != 0).any(axis=0)) + 1
-        edges = [0, *changes.tolist(), last - first]
-        for a, b in pairwise(edges):
-            if not inside[a]:
-                continue
+        for a, b in pairwise([0, *changes.tolist(), last - first]):
             start, stop = first + a, first + b
             duration = float(log.t[stop - 1] - log.t[start]) + log.sample_time
-            if duration < shortest:
+            if not signs[:, a].all() or duration < shortest:
                 continue
             label = "".join(
                 f"{n}{'+' if s > 0 else '-'}" for n, s in zip(margins, signs[:, a], strict=True)

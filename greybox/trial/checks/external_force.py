@@ -41,6 +41,7 @@ from greybox.trial.checks.motion import (
     orderly,
     slope,
 )
+from greybox.trial.convert.derived_signals import BODY, EARTH
 from greybox.trial.convert.resample import clock as make_clock
 from greybox.trial.convert.resample import hold_mean
 from greybox.trial.gaps import runs
@@ -49,8 +50,6 @@ from greybox.trial.steps import Step
 from greybox.vessel.force import generalised_force
 from greybox.vessel.vessel import Vessel
 
-_STATES = ("u", "v")
-_EARTH = ("v_n", "v_e")
 _AIR = ("u_q", "v_q")
 # time over which a rate of change is taken [s], and most of them, beyond which it is longer
 _STEP, _MOST_STEPS = 2.0, 1500
@@ -175,8 +174,8 @@ class _Read:
 
 def _read(recording: Recording, vessel: Vessel) -> _Read | str:
     """Return motion and commands of a recording, or why it has none."""
-    earth = not all(c in recording for c in _STATES)
-    names = (*(_EARTH if earth else _STATES), "psi")
+    earth = not all(c in recording for c in BODY)
+    names = (*(EARTH if earth else BODY), "psi")
     missing = [c for c in (*names, *vessel.commands) if c not in recording]
     if missing:
         return f"the log has no {', '.join(missing)}"
@@ -231,7 +230,7 @@ def _terms(x: _Read, vessel: Vessel) -> tuple[NDArray[np.int64], Array]:
     """
     motion = x.motion
     # as measured: a low-pass takes more from a turning ship than noise does from products
-    u, v, r = (motion[s] for s in (*_STATES, "r"))
+    u, v, r = (motion[s] for s in (*BODY, "r"))
     fast, aside, turn = np.abs(u), np.abs(v), np.abs(r)
     along = [u, u * fast, u**3, v * v, r * r]
     across = [v, r, u * v, v * aside, r * turn, aside * r, turn * v]
@@ -338,7 +337,7 @@ def _make_log(number: int, x: _Read, vessel: Vessel, step: float) -> _Log | str:
     count = max(1, round(step / motion.step))
     measured = np.column_stack([motion["u"], motion["v"]])
     force = np.column_stack(list(generalised_force(vessel, x.commands).values()))
-    states = np.column_stack([motion[n] for n in ("psi", *_STATES, "r")])
+    states = np.column_stack([motion[n] for n in ("psi", *BODY, "r")])
     beside = np.column_stack([states, force, terms.reshape(len(motion), -1)])
     rate, times, means, stretches, at = [], [], [], [], 0
     for a, b in motion.stretches:
@@ -1012,7 +1011,7 @@ def _finding(event: _Event, log: _Log, recording: Recording, scan: _Scan) -> Fin
         f"cannot have caused",
         f"ask what happened from t = {begin:.6g} to {end:.6g} s; leave it out of estimates, or "
         f"import --fix-also external_force",
-        _STATES,
+        BODY,
         (Step("drop", recording.names, interval=(begin, end), decided_by="check"),),
         False,
         _picture((begin, end), log, scan),

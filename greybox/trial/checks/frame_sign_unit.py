@@ -82,11 +82,6 @@ def _scaled(names: tuple[str, ...], factor: float) -> Callable[[Values], Values]
     return lambda x: {**x, **{n: x[n] * factor for n in names if n in x}}
 
 
-def _permuted(names: tuple[str, ...]) -> Callable[[Values], Values]:
-    a, b = names
-    return lambda x: {**x, a: x[b], b: x[a]}
-
-
 def _sign(*names: str, group: str, cost: float = 1.0) -> ColumnHypothesis:
     return ColumnHypothesis(
         "sign", group, names, _scaled(names, -1.0), (mend("scale", names, factor=-1.0),),
@@ -110,7 +105,7 @@ def _unit(
 
 def _swap(a: str, b: str, *, group: str, words: str = "") -> ColumnHypothesis:
     return ColumnHypothesis(
-        "sign", group, (a, b), _permuted((a, b)), (mend("exchange", (a, b)),),
+        "sign", group, (a, b), lambda x: {**x, a: x[b], b: x[a]}, (mend("exchange", (a, b)),),
         f"{a} and {b} are swapped{words}",
         f"exchange {a} and {b} (import --fix does), or correct [columns]",
         0.0,
@@ -131,10 +126,6 @@ def _earth(names: tuple[str, str], words: str) -> ColumnHypothesis:
     )  # fmt: skip
 
 
-def _degrees(x: Values) -> Values:
-    return {**x, "psi": np.unwrap(continuous(x["psi"]) * _DEG)}
-
-
 _PSI = (
     _sign("psi", group="psi"),
     ColumnHypothesis(
@@ -144,7 +135,9 @@ _PSI = (
         "replace psi by pi/2 - psi (import --fix does)", 0.0, "1",
     ),
     ColumnHypothesis(
-        "unit", "psi", ("psi",), _degrees, (mend("scale", ("psi",), factor=_DEG),),
+        "unit", "psi", ("psi",),
+        lambda x: {**x, "psi": np.unwrap(continuous(x["psi"]) * _DEG)},
+        (mend("scale", ("psi",), factor=_DEG),),
         "psi holds degrees where a log has radians",
         declare_unit(("psi",), "deg"), 180 / np.pi, "deg per rad",
     ),
@@ -417,15 +410,16 @@ def reading_findings(reading: ColumnReading, names: Sequence[str] = ()) -> list[
 
 def frame_outcomes(motion: Motion | None) -> list[Outcome]:
     """Say what could be compared, for the checks of unit, frame and sign."""
-    if motion is None or not (motion.positioned or motion.turned):
-        why = "needs positions, heading and velocities, or heading and yaw rate, that overlap"
-        return [Outcome(i, "cannot tell", why) for i in ("unit", "frame", "sign")]
     seen = []
-    if motion.positioned:
+    if motion is not None and motion.positioned:
         seen.append("positions against velocities and heading")
-    if motion.turned:
+    if motion is not None and motion.turned:
         seen.append("heading against yaw rate")
-    return [Outcome(i, "clean", " and ".join(seen)) for i in ("unit", "frame", "sign")]
+    why = "needs positions, heading and velocities, or heading and yaw rate, that overlap"
+    return [
+        Outcome(i, "clean" if seen else "cannot tell", " and ".join(seen) or why)
+        for i in ("unit", "frame", "sign")
+    ]
 
 
 def _turned(m: Motion) -> ColumnHypothesis:

@@ -13,7 +13,7 @@ from greybox.rotation import body_to_ned
 from greybox.trial.checks.finding import Finding, declare_unit, exact_finding
 from greybox.trial.convert.channel_mapping import beyond_reach
 from greybox.trial.convert.deduplicate import CUT_RUNS, second_run
-from greybox.trial.convert.derived_signals import continuous
+from greybox.trial.convert.derived_signals import EARTH, MOTION_SIGNALS, continuous
 from greybox.trial.convert.resample import clock
 from greybox.trial.gaps import GAP, HOLE, runs, usual_step
 from greybox.trial.raw_log import Array, Mask, Recording, Signal
@@ -21,7 +21,7 @@ from greybox.trial.steps import Step, mend
 from greybox.trial.time_format import unpadded_numbers
 from greybox.vessel.vessel import Vessel
 
-MOTION = ("x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "u_q", "v_q")
+MOTION = (*MOTION_SIGNALS, "u_q", "v_q")
 
 # a spike stands out of its neighbours by this many robust standard deviations
 _SPIKE = 10.0
@@ -39,8 +39,6 @@ _MATERIAL = {
 }  # fmt: skip
 # steps of rounded values that matter, as a share of the signal's spread
 _COARSE = 0.004
-# components of what one fix of a receiver tells, speed and course
-_FIX = ("v_n", "v_e")
 # a sensor that is stuck repeats itself this long
 STUCK_SECONDS = 3.0
 STUCK_SAMPLES = 8
@@ -220,11 +218,11 @@ def spike_findings(recording: Recording) -> list[Finding]:
 
 
 def _measured_with(s: Signal, recording: Recording) -> tuple[str, ...]:
-    """Return a signal, and the other component of its fix, which is as wrong."""
-    if s.name not in _FIX or any(n not in recording for n in _FIX):
+    """Return a signal, and the other component of its fix (speed and course), which is as wrong."""
+    if s.name not in EARTH or any(n not in recording for n in EARTH):
         return (s.name,)
-    one, two = (recording[n] for n in _FIX)
-    return _FIX if np.array_equal(one.t, two.t) else (s.name,)
+    one, two = (recording[n] for n in EARTH)
+    return EARTH if np.array_equal(one.t, two.t) else (s.name,)
 
 
 def _worth(name: str, value: Array) -> float:

@@ -15,7 +15,14 @@ from greybox.channels import CHANNELS
 from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.column_names import Assigned, assign, is_short_pair
-from greybox.trial.convert.derived_signals import usual_reach, wraps_by_degrees
+from greybox.trial.convert.derived_signals import (
+    BODY,
+    EARTH,
+    MOTION_SIGNALS,
+    PLACE,
+    usual_reach,
+    wraps_by_degrees,
+)
 from greybox.trial.convert.merge import merge, on_one_clock
 from greybox.trial.convert.settle_axes import settle_axes
 from greybox.trial.convert.time_scale import TimeScale, time_scale
@@ -29,16 +36,10 @@ from greybox.trial.store import read_record, recorded_provenance
 from greybox.units import unit_factor
 from greybox.vessel.vessel import Vessel
 
-MOTION = frozenset({"x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e", "lat", "lon", "sog"})
+MOTION = frozenset({*MOTION_SIGNALS, "lat", "lon", "sog"})
 
 # channels that tell what others would
-_PLACE, _BODY, _EARTH = ("x_n", "y_n"), ("u", "v"), ("v_n", "v_e")
-_ALTERNATIVES = (
-    (("lat", "lon"), _PLACE),
-    (_PLACE, ("lat", "lon")),
-    (_EARTH, _BODY),
-    (_BODY, _EARTH),
-)
+_ALTERNATIVES = ((("lat", "lon"), PLACE), (PLACE, ("lat", "lon")), (EARTH, BODY), (BODY, EARTH))
 
 # a position changes from row to row by less than this share of what it spreads over
 _SMOOTH = 0.2
@@ -256,10 +257,10 @@ def table_columns(
 
 def without_false_positions(assigned: dict[str, Assigned], batch: Batch) -> dict[str, Assigned]:
     """Leave out columns ``n`` and ``e`` whose values do not change as positions do."""
-    moves = (_moves_like_a_position(batch[assigned[n].raw]) for n in _PLACE if n in assigned)
+    moves = (_moves_like_a_position(batch[assigned[n].raw]) for n in PLACE if n in assigned)
     if not is_short_pair(assigned) or all(moves):
         return assigned
-    return {n: a for n, a in assigned.items() if n not in _PLACE}
+    return {n: a for n, a in assigned.items() if n not in PLACE}
 
 
 def _moves_like_a_position(value: NDArray[Any]) -> bool:

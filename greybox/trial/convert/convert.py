@@ -42,6 +42,7 @@ from greybox.trial.convert.time_grid import (
 from greybox.trial.kinematics import carried_gaps
 from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Array, Mask, Recording
+from greybox.trial.segments import numbered
 from greybox.trial.steps import Step, Value
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.vessel import Vessel
@@ -169,9 +170,7 @@ def import_recording(
     plan = plan_import({n: extent(c) for n, c in clocks.items()}, vessel, options, clean.name)
     conversion = Conversion(vessel, options, plan, clean.steps)
     cut = cut_segments(clean, conversion)
-    segments = cut.segments
-    if len(segments) > 1:
-        segments = [replace(s, name=f"{s.name}[{k + 1}]") for k, s in enumerate(segments)]
+    segments = numbered(cut.segments, plan.name)
     spans = [(float(s.t[0]), float(s.t[-1])) for s in segments]
     if not segments:
         raise cut.refusal(conversion)

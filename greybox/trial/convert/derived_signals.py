@@ -36,7 +36,9 @@ _TURN = 2 * np.pi + 0.5
 # order of the polynomials of positions: the velocity may bend within the window
 POSITION_ORDER = 3
 _SMOOTHING_ORDER = 2
-_BODY, _EARTH, _PLACE = ("u", "v"), ("v_n", "v_e"), ("x_n", "y_n")
+# pairs that tell of a motion, each what another would, and all of its signals
+BODY, EARTH, PLACE = ("u", "v"), ("v_n", "v_e"), ("x_n", "y_n")
+MOTION_SIGNALS = (*PLACE, "psi", *BODY, "r", *EARTH)
 
 
 def derive_signals(recording: Recording, origin: tuple[float, float] | None = None) -> Recording:
@@ -279,8 +281,8 @@ def _smooth(
 
 def made_from_positions(names: Container[str]) -> bool:
     """Whether u or v of a log with these channels is made from positions and heading."""
-    lacking = any(n not in names for n in _BODY) and any(n not in names for n in _EARTH)
-    return lacking and all(n in names for n in (*_PLACE, "psi"))
+    lacking = any(n not in names for n in BODY) and any(n not in names for n in EARTH)
+    return lacking and all(n in names for n in (*PLACE, "psi"))
 
 
 def _velocities(
@@ -291,7 +293,7 @@ def _velocities(
     if psi is None:
         return []
     steps = []
-    missing = [n for n in _BODY if n not in part]
+    missing = [n for n in BODY if n not in part]
     turning = "r" not in part and len(psi) > 2
     if turning:
         part["r"] = np.gradient(psi, sample_time)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from greybox.errors import LogError
 from greybox.trial.convert.derived_signals import wind_state
 from greybox.trial.raw_log import Array, Recording, Signal
-from greybox.trial.readers.topic_files import QUARTER, zone_of
+from greybox.trial.readers.topic_files import LARGEST_ZONE, QUARTER, zone_of
 from greybox.trial.steps import LATEST_DATE, Step, new_steps, on_zero
 from greybox.vessel.conditions import Conditions
 
@@ -28,7 +28,6 @@ Span = tuple[float, float]
 _OVERLAP = 0.05
 # the same where only another time zone lets them
 _ZONE_OVERLAP = 0.8
-_LARGEST_ZONE = 14 * 3600.0
 
 
 def merge(recordings: list[Recording]) -> Recording:
@@ -271,7 +270,7 @@ def _shift(
     middle = 0.5 * (sum(whole) - sum(span))
     found = QUARTER * round(middle / QUARTER)
     overlap = _overlap(_moved(span, found), whole)
-    if zone is None and abs(found) <= _LARGEST_ZONE and overlap >= _ZONE_OVERLAP:
+    if zone is None and abs(found) <= LARGEST_ZONE and overlap >= _ZONE_OVERLAP:
         return found
     raise LogError(
         f"'{r.name}' runs from {_clock(span[0])} to {_clock(span[1])} and "

@@ -36,7 +36,7 @@ from greybox.trial.log import Provenance, TrialLog
 from greybox.trial.raw_log import Array, Recording
 from greybox.trial.readers.formats import open_raw
 from greybox.trial.readers.table import Batch, TableFile, read_columns
-from greybox.trial.segments import join_segments
+from greybox.trial.segments import join_segments, numbered
 from greybox.vessel.vessel import Vessel
 
 _log = logging.getLogger(__name__)
@@ -175,18 +175,17 @@ def table_segments(
     known = replace(known, steps=steps, read=read, epoch=epoch, conditions=conditions)
     columns = [str(c) for c in table.columns]
     segments = []
-    for k, log in enumerate(cut.segments):
+    for log in cut.segments:
         channels = dict(log.channels)
         for other, value in (fill or {}).items():
             channels.setdefault(other, np.full(len(log), float(value)))
         _require(channels, vessel, states or ("u", "v", "r"), name, columns)
-        own = table.path.stem if len(cut.segments) == 1 else f"{table.path.stem}[{k + 1}]"
-        segments.append(replace(log, name=own, channels=channels, provenance=known))
+        segments.append(replace(log, channels=channels, provenance=known))
     _log.info(
         "read %s: %d rows every %g s in %d segment(s); columns %s%s", table.path, plan.count,
         sample_time, len(segments), ", ".join(columns), "".join(f"; {d}" for d in known.derived),
     )  # fmt: skip
-    return segments
+    return numbered(segments, table.path.stem)
 
 
 def _clean_recording(

@@ -159,10 +159,8 @@ def interpolate(of: Clock, value: Array, grid: Array, sample_time: float) -> Arr
     how = resampled_by(of.period, sample_time, held=False)
     if how == HELD:
         return hold(of, value, grid)
-    if how is None:
-        return np.interp(grid, of.t, value)
     out = np.interp(grid, of.t, value)
-    for start, stop in zip(of.starts, of.stops, strict=True):
+    for start, stop in zip(of.starts, of.stops, strict=True) if how == FILTERED else ():
         t, part = of.t[start:stop], value[start:stop]
         inside = (grid >= t[0]) & (grid <= t[-1])
         if inside.any() and len(t) > 2:

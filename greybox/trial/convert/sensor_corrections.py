@@ -136,10 +136,9 @@ def correct_channels(
     bias = now.heading_bias - before.heading_bias
     if not _same(bias, 0.0) and "psi" in out:
         out["psi"] = out["psi"] - bias
+    sensor = "antenna" if was_derived else "velocity_at"
+    arms = getattr(before, sensor), getattr(now, sensor)
     if {"u", "v"} <= out.keys():
-        arms = (
-            (before.antenna, now.antenna) if was_derived else (before.velocity_at, now.velocity_at)
-        )
         shifts = [
             late.get(own, late.get(place, 0.0) if was_derived else 0.0) / sample_time
             for own, place in (("u", "x_n"), ("v", "y_n"))
@@ -148,7 +147,7 @@ def correct_channels(
     most, least = max(late.values(), default=0.0), min(late.values(), default=0.0)
     return Correction(
         out,
-        _steps(before, now, late, turned, out, was_derived),
+        _steps(out, turned, late, bias, arms, sensor),
         notes,
         before=ceil(max(-least, 0.0) / sample_time - 1e-9),
         after=ceil(max(most, 0.0) / sample_time - 1e-9),
@@ -258,12 +257,12 @@ def _correct_velocities(
 
 
 def _steps(
-    before: _Defects,
-    now: _Defects,
-    late: Mapping[str, float],
-    turned: list[str],
     out: Mapping[str, Array],
-    was_derived: bool,
+    turned: list[str],
+    late: Mapping[str, float],
+    bias: float,
+    arms: tuple[Arm, Arm],
+    sensor: str,
 ) -> tuple[Step, ...]:
     """Return what was done, each by how much more than before."""
 
@@ -273,11 +272,9 @@ def _steps(
     steps = [step("scale", turned, factor=-1.0)] if turned else []
     for seconds in dict.fromkeys(late.values()):
         steps.append(step("shift", (c for c, s in late.items() if s == seconds), late=seconds))
-    bias = now.heading_bias - before.heading_bias
     if not _same(bias, 0.0) and "psi" in out:
         steps.append(step("turn_heading", ("psi",), angle=bias))
-    sensor = "antenna" if was_derived else "velocity_at"
-    (x0, y0), (x1, y1) = getattr(before, sensor), getattr(now, sensor)
+    (x0, y0), (x1, y1) = arms
     if not (_same(x0, x1) and _same(y0, y1)) and {"u", "v"} <= out.keys():
         steps.append(step("move_velocity", ("u", "v"), x=x1 - x0, y=y1 - y0, sensor=sensor))
     return tuple(steps)

@@ -9,7 +9,14 @@ from itertools import pairwise
 import numpy as np
 
 from greybox.errors import LogError
-from greybox.trial.convert.derived_signals import POSITION_ORDER, made_from_positions
+from greybox.trial.convert.derived_signals import (
+    BODY,
+    EARTH,
+    MOTION_SIGNALS,
+    PLACE,
+    POSITION_ORDER,
+    made_from_positions,
+)
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.resample import Clock, covered, nice_period, resampled_by, stretches
 from greybox.trial.gaps import split_at_gaps
@@ -18,9 +25,8 @@ from greybox.trial.smoothing import window_samples
 from greybox.trial.steps import Step
 from greybox.vessel.vessel import Vessel
 
-_MOTION = ("x_n", "y_n", "psi", "u", "v", "r", "v_n", "v_e")
 _WIND = ("u_q", "v_q", "w_n", "w_e", "w_x", "w_y")
-_BODY, _EARTH, _PLACE = frozenset({"u", "v"}), frozenset({"v_n", "v_e"}), frozenset({"x_n", "y_n"})
+_BODY, _EARTH, _PLACE = map(frozenset, (BODY, EARTH, PLACE))
 # what serves as well as a motion signal
 _INSTEAD: dict[str, tuple[frozenset[str], ...]] = {
     "r": (frozenset({"psi"}),), "v_n": (_BODY, _PLACE), "v_e": (_BODY, _PLACE),
@@ -133,7 +139,9 @@ class Plan:
         """Return the samples at which motions were not measured, of those that have such."""
         gaps = {}
         for s in recording.signals:
-            if s.name not in _MOTION or (self.times is None and s.name in self.reference_channels):
+            if s.name not in MOTION_SIGNALS or (
+                self.times is None and s.name in self.reference_channels
+            ):
                 continue
             if self.times is None:
                 gap = ~covered(grid, clocks[s.name])
@@ -160,7 +168,7 @@ def plan_import(
     # a run needs no positions where its velocities were measured
     spare = _PLACE if any(pair <= used.keys() for pair in (_BODY, _EARTH)) else frozenset()
     beside = set(vessel.recorded_columns) - set(vessel.commands)
-    reference = [n for n in _MOTION if n in used] or inputs
+    reference = [n for n in MOTION_SIGNALS if n in used] or inputs
     sample_time = options.sample_time or _sample_time([used[n] for n in reference])
     held = [n for n in used if n not in (*reference, *beside) and used[n].steady]
     late = [n for n in inputs if n not in reference and n not in held]
@@ -219,9 +227,9 @@ def _usable(
     used = {
         n: e
         for n, e in extents.items()
-        if e.count >= MIN_SEGMENT and n in {*_MOTION, *_WIND, *commands, *beside}
+        if e.count >= MIN_SEGMENT and n in {*MOTION_SIGNALS, *_WIND, *commands, *beside}
     }
-    motion = [n for n in _MOTION if n in used]
+    motion = [n for n in MOTION_SIGNALS if n in used]
     inputs = [c for c in vessel.commands if c in used]
     if not motion and not inputs:
         held = ", ".join(f"{n} ({e.count})" for n, e in extents.items())

@@ -13,7 +13,7 @@ from typing import Any
 
 from greybox.errors import LogError
 from greybox.trial.readers import cells as cell_text
-from greybox.trial.readers.layout import find_layout
+from greybox.trial.readers.layout import Layout, find_layout
 from greybox.trial.readers.limits import limits
 from greybox.trial.readers.table import Batch
 from greybox.trial.steps import Step
@@ -22,20 +22,10 @@ _BLANKS = re.compile(rb"[ \t]+")
 
 
 @dataclass
-class CsvFile:
+class CsvFile(Layout):
     """A CSV file whose layout has been found out from its first lines."""
 
     path: Path
-    columns: tuple[str, ...]
-    delimiter: str
-    decimal: str
-    encoding: str
-    skip: int
-    units: dict[str, str] = field(default_factory=dict)
-    text: frozenset[str] = frozenset()
-    dates: frozenset[str] = frozenset()
-    clocks: frozenset[str] = frozenset()
-    notes: list[str] = field(default_factory=list)
     format: str = "CSV"
     first_row: int = 2
     steps: tuple[Step, ...] = ()
@@ -193,24 +183,7 @@ def open_csv(path: Path) -> CsvFile:
         The file is empty, is no text, has no header line or no rows, or a line
         is longer than 4 MiB.
     """
-    found = find_layout(path)
-    by_kind = {
-        kind: frozenset(n for n, k in found.kinds.items() if k == kind)
-        for kind in ("text", "date", "clock")
-    }
-    return CsvFile(
-        path,
-        found.columns,
-        found.delimiter,
-        found.decimal,
-        found.encoding,
-        found.skip,
-        found.units,
-        by_kind["text"],
-        by_kind["date"],
-        by_kind["clock"],
-        found.notes,
-    )
+    return CsvFile(**vars(find_layout(path)), path=path)
 
 
 class _Clean(RawIOBase):

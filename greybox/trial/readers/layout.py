@@ -26,7 +26,7 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
 _MARKS = "#%"
 
 
-@dataclass(frozen=True)
+@dataclass
 class Layout:
     """What the first lines of a table tell.
 
@@ -41,8 +41,8 @@ class Layout:
         Lines before the first row.
     units : dict of str to str
         Where a line of units stands below the names.
-    kinds : dict of str to str
-        number, date, clock or text for each column.
+    text, dates, clocks : frozenset of str
+        Columns of words, of dates and of times of day.
     notes : list of str
         What was recovered.
     """
@@ -53,7 +53,9 @@ class Layout:
     encoding: str
     skip: int
     units: dict[str, str]
-    kinds: dict[str, str]
+    text: frozenset[str]
+    dates: frozenset[str]
+    clocks: frozenset[str]
     notes: list[str]
 
 
@@ -165,8 +167,13 @@ def find_layout(path: Path) -> Layout:
         name: cells.kind((row[k] for row in data), comma=split.delimiter != ",")
         for k, name in enumerate(columns)
     }
+    text, dates, clocks = (
+        frozenset(n for n, kind in kinds.items() if kind == wanted)
+        for wanted in ("text", "date", "clock")
+    )
+    skip = at[split.first_row]
     return Layout(
-        columns, split.delimiter, decimal, encoding, at[split.first_row], units, kinds, notes
+        columns, split.delimiter, decimal, encoding, skip, units, text, dates, clocks, notes
     )
 
 

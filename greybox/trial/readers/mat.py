@@ -17,7 +17,7 @@ from greybox.errors import LogError, suggestion
 from greybox.files import sha256
 from greybox.trial.raw_log import Array, Recording, Signal, SourceFile, free_name, shortened
 from greybox.trial.readers.limits import limits
-from greybox.trial.readers.mat_tree import Tree, Unreadable
+from greybox.trial.readers.mat_process import Tree, Unreadable
 from greybox.trial.readers.matfile import load_tree
 from greybox.units import UNITS, find_unit, is_unix_time, spelled_unit, time_unit, unix_unit
 
@@ -155,7 +155,7 @@ class _Reader:
     def _value(self, path: str, key: str, value: Any, scope: _Scope, tree: Tree) -> None:
         if isinstance(value, Unreadable):
             said = f"'{path}' was left out: {value.reason}."
-            self.unreadable = self.unreadable or said
+            self.unreadable = self.unreadable or f"{said} "
             self.note(said)
         elif isinstance(value, dict):
             if key.casefold() in ("properties", "timeinfo", "datainfo"):
@@ -268,7 +268,7 @@ class _Reader:
             lengths = ", ".join(f"'{t.name}' ({len(t.t)})" for t in self.times[:5])
             raise LogError(
                 f"'{self.name}' holds times {lengths} but no signal of that length; it holds "
-                f"{_inventory(tree)}. {self._objects()}Save columns as long as their time."
+                f"{_inventory(tree)}. {self.unreadable}Save columns as long as their time."
             )
         return name, tuple(signals), text, epoch
 
@@ -315,14 +315,11 @@ class _Reader:
             return None
         return unit.symbol
 
-    def _objects(self) -> str:
-        return f"{self.unreadable} " if self.unreadable else ""
-
     def _no_time(self, tree: Tree) -> str:
         names = [f.name.rsplit(".", 1)[-1] for f in self.found]
         near = suggestion("time", [n for n in names if n.casefold().startswith("t")])
         return (
-            f"'{self.name}' holds no time; it holds {_inventory(tree)}.{near} {self._objects()}"
+            f"'{self.name}' holds no time; it holds {_inventory(tree)}.{near} {self.unreadable}"
             f"Save a column of seconds called 't' beside the signals, or in their struct."
         )
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from greybox.errors import LogError
 from greybox.trial.readers.limits import limits
-from greybox.trial.readers.mat_process import load_by_scipy
-from greybox.trial.readers.mat_tree import (
+from greybox.trial.readers.mat_process import (
     COMPLEX,
     MalformedError,
     Tally,
     Tree,
     Unreadable,
+    load_by_scipy,
     opaque,
 )
 

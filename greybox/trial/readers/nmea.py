@@ -74,7 +74,8 @@ class _Stream:
         self.counts: Counter[str] = Counter()
         self.skipped: Counter[str] = Counter()
         self.remarks: Counter[str] = Counter()
-        self.order = 0
+        # lines so far, those among them with a stamp, and sentences with a checksum
+        self.order = self.stamped = self.checksums = 0
         # stamp before each line, by its number; only as long as the last line that has one
         self.stamps = array("d")
         self.sentence = ""
@@ -88,6 +89,7 @@ class _Stream:
         track.value.append(value)
 
     def stamp(self, value: float) -> None:
+        self.stamped += 1
         missing = self.order - len(self.stamps)
         self.stamps.extend([nan] * missing)
         self.stamps.append(value)
@@ -394,12 +396,10 @@ def read_nmea(path: Path) -> Recording:
         The file holds no sentence that can be read, or none with a time.
     """
     stream = _Stream()
-    seen = _Seen()
     for raw in _lines(path):
         line = raw.strip()
         if not line:
             continue
-        seen.lines += 1
         stream.order += 1
         start = line.find(b"$")
         if start < 0:
@@ -410,33 +410,23 @@ def read_nmea(path: Path) -> Recording:
             stamp = _stamp(line[:start])
             if stamp is not None:
                 stream.stamp(stamp)
-                seen.stamped += 1
         # where an end of line was lost, the sentence behind it is still whole
         for sentence in line[start + 1 :].split(b"$"):
-            _take(sentence, stream, seen)
-    return _recording(path, stream, seen)
+            _take(sentence, stream)
+    return _recording(path, stream)
 
 
-@dataclass
-class _Seen:
-    """Counts of lines, of those with a stamp, and of sentences with a checksum."""
-
-    lines: int = 0
-    stamped: int = 0
-    checksums: int = 0
-
-
-def _take(sentence: bytes, stream: _Stream, seen: _Seen) -> None:
+def _take(sentence: bytes, stream: _Stream) -> None:
     """Understand one sentence, given without its ``$``, or count why not."""
     body, star, check = sentence.rpartition(b"*")
     if not star:
         # believed only in files that carry no checksums at all
-        if seen.checksums:
+        if stream.checksums:
             stream.skipped["truncated sentences"] += 1
             return
         body = check
     else:
-        seen.checksums += 1
+        stream.checksums += 1
         try:
             right = reduce(xor, body, 0) == int(check[:2], 16) and len(check) >= 2
         except ValueError:
@@ -495,13 +485,14 @@ def _stamp(prefix: bytes) -> float | None:
     return moment.timestamp()
 
 
-def _recording(path: Path, stream: _Stream, seen: _Seen) -> Recording:
+def _recording(path: Path, stream: _Stream) -> Recording:
     if not stream.counts:
         raise LogError(
-            f"'{path.name}' holds no NMEA 0183 sentence that can be read among {seen.lines} lines "
-            f"({sum(stream.skipped.values())} skipped): name a file of sentences such as GGA, HDT."
+            f"'{path.name}' holds no NMEA 0183 sentence that can be read among {stream.order} "
+            f"lines ({sum(stream.skipped.values())} skipped): name a file of sentences such as "
+            f"GGA, HDT."
         )
-    stamped = seen.stamped > 0.9 * seen.lines
+    stamped = stream.stamped > 0.9 * stream.order
     if not len(stream.tags) and not stamped:
         raise LogError(
             f"'{path.name}' has {sum(stream.counts.values())} sentences but none with a time "

@@ -35,6 +35,8 @@ STAMP = "header_stamp"
 # between the clocks of two time zones there are whole quarters of an hour, and a short delay
 QUARTER = 900.0
 ZONE_DELAY = 10.0
+# the earth has zones from 12 h behind to 14 h ahead of UTC
+LARGEST_ZONE = 14 * 3600.0
 
 _SECONDS = re.compile(r"^(.*?)(?:secs|sec)$")
 _NANOS = ("nsecs", "nsec", "nanosecs", "nanosec", "nanoseconds")
@@ -190,8 +192,7 @@ def as_topic(table: TableFile) -> TableFile:
 def zone_of(ahead: float) -> float | None:
     """Return the time zone [s] by which one clock is ahead of another, None where it is none."""
     zone = QUARTER * round(ahead / QUARTER)
-    # the earth has zones from 12 h behind to 14 h ahead of UTC
-    known = zone != 0 and abs(zone) <= 14 * 3600
+    known = zone != 0 and abs(zone) <= LARGEST_ZONE
     return zone if known and abs(ahead - zone) <= ZONE_DELAY else None
 
 

@@ -26,7 +26,20 @@ from greybox.trial.checks.sensor_offsets.evidence import (
     search,
 )
 from greybox.trial.checks.sensor_offsets.input_clock import input_clocks, response_delays
-from greybox.trial.checks.sensor_offsets.model import ARM, BIAS, CLOCKS, SIZE, KinematicModel
+from greybox.trial.checks.sensor_offsets.model import (
+    ARM,
+    BIAS,
+    CLOCKS,
+    LEAST_CLOCK,
+    LEAST_HEADING,
+    MOST_LATE,
+    SIGMAS,
+    SIZE,
+    KinematicModel,
+    expected,
+    least,
+    most_arm,
+)
 from greybox.trial.checks.sensor_offsets.pool import Pooled, pool
 from greybox.trial.checks.sensor_offsets.select import (
     POSITIONS,
@@ -37,15 +50,6 @@ from greybox.trial.checks.sensor_offsets.select import (
     possible,
     score_hypotheses,
     separation,
-)
-from greybox.trial.checks.sensor_offsets.thresholds import (
-    LEAST_CLOCK,
-    LEAST_HEADING,
-    MOST_LATE,
-    SIGMAS,
-    expected,
-    least,
-    most_arm,
 )
 from greybox.trial.raw_log import Array, Recording
 from greybox.trial.steps import mend

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.trial.checks.sensor_offsets.evidence import Evidence
-from greybox.trial.checks.sensor_offsets.model import ARM, BIAS, CLOCKS, SIZE
-from greybox.trial.checks.sensor_offsets.thresholds import CAMPAIGN, SIGMAS
+from greybox.trial.checks.sensor_offsets.model import ARM, BIAS, CAMPAIGN, CLOCKS, SIGMAS, SIZE
 from greybox.trial.raw_log import Array, Mask
 
 # instruments that change between campaigns as one: the positions against all, heading, velocities,

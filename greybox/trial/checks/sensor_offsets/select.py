@@ -9,15 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
-from greybox.trial.checks.sensor_offsets.model import ARM, BIAS, CLOCKS, SIZE
-from greybox.trial.checks.sensor_offsets.thresholds import (
+from greybox.trial.checks.sensor_offsets.model import (
+    ARM,
+    BIAS,
+    CLOCKS,
     LEAST_CLOCK,
     LEAST_HEADING,
     MOST_LATE,
     SIGMAS,
+    SIZE,
     least_arm,
     most_arm,
 )
@@ -143,9 +147,8 @@ def hypotheses(channels: tuple[str, ...], *, turned: bool) -> Iterator[Hypothesi
     flags = (False, True) if positioned else (False,)
     for parts in _partitions(names):
         clocks = tuple(sorted((tuple(p) for p in parts), key=_weight, reverse=True))
-        for arm in flags:
-            for bias in flags:
-                yield Hypothesis(clocks, arm, bias)
+        for arm, bias in product(flags, repeat=2):
+            yield Hypothesis(clocks, arm, bias)
 
 
 def score_hypotheses(

@@ -175,14 +175,13 @@ class _Topic:
             return
         try:
             message = decode(data)
+            found = self._extract(message)
         except DecodeError as error:
             # only the kind: bytes and positions differ from message to message
             self._skip(
                 "they cannot be decoded" if self.columns else f"they cannot be decoded: {error}"
             )
             return
-        try:
-            found = self._extract(message)
         except SkippedMessageError as error:
             self._skip(str(error))
             return
