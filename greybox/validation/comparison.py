@@ -160,27 +160,32 @@ class Comparison(DisplayMixin):
             "notes": list(self.notes),
         }
 
+    @property
+    def _width(self) -> int:
+        """Of the column of models: names that are cut may be alike."""
+        return max(24, 1 + max(map(len, self.names)))
+
     def summary(self) -> str:
         """Return the tables as text."""
         states = list(self.runs[0][0].fit)
+        width, of_log = self._width, max(26, 1 + max(len(r.log.name) for r in self.runs[0]))
         lines = [
-            f"{'model':<24}{'log':<26}"
+            f"{'model':<{width}}{'log':<{of_log}}"
             + "".join(f"{'fit ' + s + ' [%]':>12}" for s in states)
             + "".join(f"{title:>15}" for title in rmse_titles(states))
         ]
         for name, row, errors in zip(self.names, self.runs, self.rmse, strict=True):
             for run, rmse in zip(row, errors, strict=True):
                 lines.append(
-                    f"{name[:23]:<24}{run.log.name[:25]:<26}"
+                    f"{name:<{width}}{run.log.name:<{of_log}}"
                     + "".join(f"{run.fit[s]:>12.1f}" for s in states)
                     + "".join(f"{rmse[s]:>15.3g}" for s in states)
                     + (f"  diverged at sample {run.diverged}" if run.diverged >= 0 else "")
                 )
             if len(row) > 1:
                 mean = {s: float(np.mean([r.fit[s] for r in row])) for s in states}
-                lines.append(
-                    f"{name[:23]:<24}{'mean':<26}" + "".join(f"{mean[s]:>12.1f}" for s in states)
-                )
+                shown = "".join(f"{mean[s]:>12.1f}" for s in states)
+                lines.append(f"{name:<{width}}{'mean':<{of_log}}{shown}")
         for name, aheads in zip(self.names, self.ahead, strict=True):
             for horizon in sorted(set().union(*aheads), key=float):
                 error = {
@@ -191,10 +196,10 @@ class Comparison(DisplayMixin):
                     f"{s} {e:.3g} {CHANNELS[s].unit}" if np.isfinite(e) else f"{s} diverged"
                     for s, e in error.items()
                 )
-                lines.append(f"{name[:23]:<24}{horizon} s ahead, rms error: {shown}")
+                lines.append(f"{name:<{width}}{horizon} s ahead, rms error: {shown}")
         lines += self._covered()
         lines += [
-            f"{name[:23]:<24}note: {d.sentence}"
+            f"{name:<{width}}note: {d.sentence}"
             for name, differences in zip(self.names, self.conditions, strict=True)
             for d in differences
         ]
@@ -250,7 +255,7 @@ class Comparison(DisplayMixin):
 
     def _covered(self) -> list[str]:
         """Return a line a model on how many measurements its bands hold."""
-        lines = []
+        lines, width = [], self._width
         for name, row in zip(self.names, self.bands, strict=True):
             held = [b for b in row if b is not None and b.coverage]
             if held:
@@ -259,9 +264,9 @@ class Comparison(DisplayMixin):
                     for s in held[0].coverage
                     if all(s in b.coverage for b in held)
                 )
-                lines.append(f"{name[:23]:<24}samples in the {100 * LEVEL:.0f} % band: {shown}")
+                lines.append(f"{name:<{width}}samples in the {100 * LEVEL:.0f} % band: {shown}")
             for note in dict.fromkeys(n for b in row if b is not None for n in b.notes):
-                lines.append(f"{name[:23]:<24}bands: {note}")
+                lines.append(f"{name:<{width}}bands: {note}")
         return lines
 
 

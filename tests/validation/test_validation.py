@@ -125,6 +125,16 @@ def test_comparison_tells_models_apart(thesis_model, clean_log, noisy_log):
     assert "rmse r [rad/s]" in c.summary()
 
 
+def test_long_names_stay_apart_in_the_summary(thesis_model, clean_log):
+    log = replace(clean_log, name="zig-zag to starboard, 17 May, run 2")
+    names = [f"campaigns/2024-05-17/{run}/model.json" for run in "ab"]
+    lines = compare(dict.fromkeys(names, thesis_model), [log], bands=False).summary().splitlines()
+    assert lines[0].index("log") == len(names[0]) + 1
+    for name in names:
+        assert sum(line.startswith(f"{name} {log.name} ") for line in lines) == 1
+        assert sum(line.startswith(f"{name} 10 s ahead") for line in lines) == 1
+
+
 def test_only_tables_are_kept_of_logs_that_are_not_drawn(thesis_model, noisy_log):
     columns = [[noisy_log.window(k, k + 300)] for k in (0, 300, 600)]
     known = {"thesis": thesis_model}
