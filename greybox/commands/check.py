@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", metavar="HTML", help="write a page with a picture per finding")
     add_memory(
         parser,
-        "logs that would take more memory than this [GiB] are judged together in groups, in their "
-        "order, and nothing is drawn of them",
+        "memory limit [GiB]; larger sets of logs are judged in groups of neighbours instead of all "
+        "together, and no pictures are drawn",
     )
 
 

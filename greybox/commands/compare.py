@@ -46,8 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_memory(
         parser,
-        "logs that would take more memory than this [GiB] are read one file at a time, and only "
-        "what the tables tell is kept of each, with --report the samples of those drawn",
+        "memory limit [GiB]; larger sets of logs are read one file at a time, and only what the "
+        "tables show is kept of each, with --report the samples of those that are drawn",
     )
     add_seed(parser)
 

@@ -191,7 +191,7 @@ def _with_files(steps: Sequence[str], record: Mapping[str, Any]) -> list[str]:
 
 def _drawn_from(drawn: Drawn) -> str:
     return (
-        f"the logs hold {drawn.data.samples} samples, more than --memory lets in, and the "
+        f"the logs hold {drawn.data.samples} samples, more than fit into --memory, and the "
         f"diagnosis rests on {drawn.part}."
     )
 

@@ -139,8 +139,8 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--plan",
         metavar="PLAN",
-        help="plan of greybox design that the ship followed: its lead-in is left out, and its "
-        "validation part judges an estimate of the rest before it takes part in the model",
+        help="plan of greybox design that the ship followed: its lead-in is left out, and an "
+        "estimate of the rest is judged on its validation part; the model then rests on both",
     )
     group.add_argument(
         "--margin-u",

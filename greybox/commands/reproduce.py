@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from greybox.commands.common import (
     add_cluster,
@@ -18,6 +18,9 @@ from greybox.commands.common import (
     provenance,
     say,
 )
+
+if TYPE_CHECKING:
+    from greybox.study.chapter7 import Chapter7
 
 HELP = "repeat the studies of the thesis, of the estimators' efficiency and of the diagnosis' power"
 EXAMPLES = """examples:
@@ -109,15 +112,16 @@ def _run(options: argparse.Namespace) -> None:
     from greybox.errors import UsageError
     from greybox.report import studies
 
-    record = provenance(options)
-    if options.study == "chapter4":
+    record, study = provenance(options), options.study
+    seen = progress(study.replace("chapter", "chapter "))
+    if study == "chapter4":
         from greybox.study.chapter4 import reproduce_chapter4
 
         four = reproduce_chapter4(
-            options.runs, options.seed, workers=options.workers, progress=progress("chapter 4")
+            options.runs, options.seed, workers=options.workers, progress=seen
         )
         output = studies.chapter4_output(four, record)
-    elif options.study == "chapter6":
+    elif study == "chapter6":
         from greybox.study.chapter6 import reproduce_chapter6
 
         six = reproduce_chapter6(
@@ -125,10 +129,10 @@ def _run(options: argparse.Namespace) -> None:
             options.seed,
             fit_runs=min(100, options.runs) if options.out else 0,
             workers=options.workers,
-            progress=progress("chapter 6"),
+            progress=seen,
         )
         output = studies.chapter6_output(six, record)
-    elif options.study == "efficiency":
+    elif study == "efficiency":
         from greybox.report.efficiency import efficiency_output
         from greybox.study.efficiency import LEAST_RUNS, reproduce_efficiency
 
@@ -137,39 +141,28 @@ def _run(options: argparse.Namespace) -> None:
                 f"--runs is {options.runs}, the covariance of the estimates needs at least "
                 f"{LEAST_RUNS} runs."
             )
-        output = efficiency_output(
-            reproduce_efficiency(
-                options.runs, options.seed, workers=options.workers, progress=progress("efficiency")
-            ),
-            record,
+        efficiency = reproduce_efficiency(
+            options.runs, options.seed, workers=options.workers, progress=seen
         )
-    elif options.study == "power":
-        _power(options, record)
-        return
+        output = efficiency_output(efficiency, record)
+    elif study == "power":
+        from greybox.report.power import power_output
+        from greybox.study.power import judge_by_diagnosis, oracle_by_fit, run_power
+
+        power = run_power(
+            judge_by_diagnosis, oracle=oracle_by_fit, runs=options.runs,
+            none_runs=5 * options.runs, seed=options.seed, workers=options.workers, progress=seen,
+        )  # fmt: skip
+        output = power_output(power, record)
     else:
-        output = studies.chapter7_output(_chapter7(options), record)
+        output = studies.chapter7_output(_chapter7(options, seen), record)
     say(output.text)
     if options.out:
         studies.write_output(output, options.out)
         say(f"wrote {options.out}/tables.csv, {options.out}/report.html and the figures")
 
 
-def _power(options: argparse.Namespace, record: dict[str, Any]) -> None:
-    from greybox.report.power import power_output, write_power
-    from greybox.study.power import judge_by_diagnosis, oracle_by_fit, run_power
-
-    study = run_power(
-        judge_by_diagnosis, oracle=oracle_by_fit, runs=options.runs,
-        none_runs=5 * options.runs, seed=options.seed, workers=options.workers,
-        progress=progress("power"),
-    )  # fmt: skip
-    say(power_output(study, record).text)
-    if options.out:
-        write_power(study, record, options.out)
-        say(f"wrote {options.out}/tables.csv, {options.out}/report.html and the figures")
-
-
-def _chapter7(options: argparse.Namespace):  # type: ignore[no-untyped-def]
+def _chapter7(options: argparse.Namespace, seen: Callable[[int, int], None]) -> Chapter7:
     from greybox.commands.common import read_logs
     from greybox.errors import UsageError
     from greybox.model.catalogue import structure_for
@@ -201,6 +194,4 @@ def _chapter7(options: argparse.Namespace):  # type: ignore[no-untyped-def]
     structure = None
     if options.structure is not None:
         structure = structure_for(options.structure, force_inputs(estimation[0].vessel))
-    return reproduce_chapter7(
-        estimation, validation, structure=structure, progress=progress("chapter 7")
-    )
+    return reproduce_chapter7(estimation, validation, structure=structure, progress=seen)

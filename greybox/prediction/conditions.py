@@ -25,7 +25,7 @@ FEWEST_DRAWS = 40
 
 @dataclass(frozen=True)
 class Conditions:
-    """What is asked.
+    """Orders, approach and limits of the manoeuvres to predict, and how many draws.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class Task:
 
 
 def check(kind: Kind, model: ManoeuvringModel, asked: Conditions) -> None:
-    """Refuse what cannot be asked of this model.
+    """Refuse conditions that the model or its vessel cannot meet.
 
     Raises
     ------

@@ -24,7 +24,7 @@ _ALONG = 0.5
 
 @dataclass(frozen=True)
 class Helm:
-    """What steers and what propels.
+    """Which commands steer the vessel and which propel it.
 
     Parameters
     ----------

@@ -175,7 +175,7 @@ def misfit_of(
     *,
     goes_on: bool,
 ) -> Push | None:
-    """Return the misfit of all runs of a manoeuvre, none of the estimate's own.
+    """Return the random forces that a structure lacks, zero in the estimate's own run.
 
     Its size is such that runs on the commands of the estimate's own run differ from it, by
     misfit and parameters together, as much as those on logs that took no part differed from

@@ -138,8 +138,8 @@ def model_notes(model: ManoeuvringModel, helm: Helm, asked: Conditions) -> tuple
             "intervals hold the uncertainty of the parameters"
             + (" and of the current" if asked.current and model.disturbances else "")
             + (
-                ". They leave out how far its free runs are off on held-out logs, which MODEL does "
-                "not state (one of greybox estimate does), and what waves"
+                ". They leave out the errors of the model's free runs on held-out logs, which "
+                "MODEL does not hold (one that greybox estimate wrote does), and what waves"
                 if held_out_errors(model) is None
                 else " and the forces that the model lacks, by how far its free runs were off on "
                 "held-out logs. They leave out what waves"

@@ -32,6 +32,12 @@ WORDS = {
     Compliance.OPEN: "cannot be told",
     Compliance.NOT_APPLICABLE: "not applicable",
 }
+TITLES = {
+    "turning": "turning circle",
+    "zigzag": "zig-zag",
+    "stopping": "stop without thrust",
+    "crash": "crash stop",
+}
 # the quantity that each criterion is about
 CRITERIA = {
     "advance": "advance",
@@ -279,12 +285,7 @@ class ManoeuvrePrediction(DisplayMixin):
 
     def summary(self) -> str:
         """Return all manoeuvres as text."""
-        title = {
-            "turning": "Turning circle",
-            "zigzag": "Zig-zag",
-            "stopping": "Stop without thrust",
-            "crash": "Crash stop",
-        }[self.kind]
+        title = TITLES[self.kind].capitalize()
         lines = [
             f"{title} of {self.vessel}, predicted; 95 % intervals from {self.draws} draws",
             self.steering,
@@ -337,13 +338,19 @@ class ManoeuvrePrediction(DisplayMixin):
         }  # fmt: skip
 
 
+def limit_words(criterion: Criterion) -> str:
+    """Return the limit of a criterion with its unit, empty where it has none."""
+    if criterion.limit is None:
+        return ""
+    angle = criterion.measured is not None and criterion.measured.unit == "rad"
+    return f"{math.degrees(criterion.limit):.1f} deg" if angle else f"{criterion.limit:g} L"
+
+
 def verdict_line(criterion: Criterion) -> str:
     """Return limit, verdict and reason of a criterion in one line."""
-    word = WORDS[criterion.verdict]
-    if criterion.limit is None:
+    word, limit = WORDS[criterion.verdict], limit_words(criterion)
+    if not limit:
         return f"{criterion.name}: {word}, because {criterion.reason}"
-    angle = criterion.measured is not None and criterion.measured.unit == "rad"
-    limit = f"{math.degrees(criterion.limit):.1f} deg" if angle else f"{criterion.limit:g} L"
     note = f" ({criterion.reason})" if criterion.reason else ""
     return f"{criterion.name}, at most {limit}: {word}{note}"
 

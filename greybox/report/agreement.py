@@ -32,13 +32,13 @@ class Widths:
     heading: float
 
     def times(self, factor: float) -> Widths:
-        """Return wider ones."""
+        """Return them multiplied by a factor."""
         return Widths(self.position * factor, self.heading * factor)
 
 
 @dataclass(frozen=True)
 class Smoothed:
-    """What both sides are made of, on one grid.
+    """Smoothed signals of one time grid, from which both velocities are computed.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class Agreement:
 
 
 def find_widths(motion: Motion) -> Widths:
-    """Choose how far to smooth: until derivatives keep little noise, and no further.
+    """Choose the least smoothing after which derivatives have little noise.
 
     Parameters
     ----------

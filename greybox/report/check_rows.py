@@ -53,7 +53,7 @@ def label_of(name: str, unit: str | None) -> str:
 
 
 def gap_figure(finding: Finding, recording: Recording) -> Figure:
-    """Draw a signal with its holes, the longest one closer, and the steps of its clock."""
+    """Draw a signal with its gaps, a close-up of the longest, and the steps of its clock."""
     names: tuple[str, ...] = finding.picture["names"]
     gaps: list[tuple[float, float]] = finding.picture["gaps"]
     times: Array = finding.picture["t"]
@@ -109,7 +109,7 @@ def order_figure(finding: Finding) -> Figure:
 
 
 def fractions_figure(finding: Finding) -> Figure:
-    """Draw how late the times come that lack the zeros of their fraction, and the first closer."""
+    """Draw by how much times are late whose fractions lack leading zeros, and a close-up."""
     meant: Array = finding.picture["meant"]
     written: Array = finding.picture["written"]
     figure, whole, zoom, _ = _axes("Fractions of a second without leading zeros")
@@ -126,7 +126,7 @@ def fractions_figure(finding: Finding) -> Figure:
 
 
 def missing_figure(finding: Finding, recording: Recording) -> Figure:
-    """Draw a signal with the stretches that hold no number, and the longest one closer."""
+    """Draw a signal with the stretches that hold no number, and a close-up of the longest."""
     t: Array = finding.picture["t"]
     bad: NDArray[np.bool_] = finding.picture["bad"]
     timed = np.isfinite(t)
@@ -155,7 +155,7 @@ def missing_figure(finding: Finding, recording: Recording) -> Figure:
 
 
 def spike_figure(finding: Finding) -> Figure:
-    """Draw the whole signal with its spikes marked, and the largest one closer."""
+    """Draw the whole signal with its outliers marked, and a close-up of the largest."""
     t: Array = finding.picture["t"]
     value: Array = finding.picture["value"]
     spikes: NDArray[np.int64] = finding.picture["spikes"]
@@ -182,7 +182,7 @@ def spike_figure(finding: Finding) -> Figure:
 
 
 def wrap_figure(finding: Finding) -> Figure:
-    """Draw the recorded heading with what lies between its sides, closer, and without it."""
+    """Draw the heading with samples interpolated across its wrap, close up, and without them."""
     t: Array = finding.picture["t"]
     turn = float(finding.picture["turn"])
     value: Array = finding.picture["value"] * (360.0 / turn)
@@ -209,7 +209,7 @@ def wrap_figure(finding: Finding) -> Figure:
 
 
 def hold_figure(finding: Finding) -> Figure:
-    """Draw a coordinate with its held samples, the longest hold closer, and the way per sample."""
+    """Draw a coordinate with its held samples, a close-up of the longest, and its increments."""
     t: Array = finding.picture["t"]
     held: NDArray[np.int64] = finding.picture["held"]
     worst = int(finding.picture["worst"])
@@ -235,7 +235,7 @@ def hold_figure(finding: Finding) -> Figure:
 
 
 def jump_figure(finding: Finding) -> Figure:
-    """Draw the coordinate that jumps most, closer around the jump, and the track there."""
+    """Draw the coordinate that jumps most, a close-up of the jump, and the track there."""
     t: Array = finding.picture["t"]
     after = float(finding.picture["after"])
     size = np.abs(np.asarray(finding.value))
@@ -266,7 +266,7 @@ def jump_figure(finding: Finding) -> Figure:
 
 
 def stuck_figure(finding: Finding, recording: Recording) -> Figure:
-    """Draw the plateau in the whole signal and closer, beside a channel that moves on."""
+    """Draw the plateau in the whole signal and close up, beside a channel that moves meanwhile."""
     t: Array = finding.picture["t"]
     value: Array = finding.picture["value"]
     start, stop = finding.picture["stretch"]
@@ -290,7 +290,7 @@ def stuck_figure(finding: Finding, recording: Recording) -> Figure:
 
 
 def coarse_figure(finding: Finding) -> Figure:
-    """Draw the steps of a signal closer, and how large its changes are."""
+    """Draw a close-up of the steps of a signal, and a histogram of its changes."""
     t: Array = finding.picture["t"]
     value: Array = finding.picture["value"]
     step = float(finding.picture["step"])
@@ -322,7 +322,7 @@ def coarse_figure(finding: Finding) -> Figure:
 
 
 def range_figure(finding: Finding) -> Figure:
-    """Draw an angle against the range that its name allows, as logged and mended."""
+    """Draw an angle against the range that radians allow, as logged and mended."""
     t: Array = finding.picture["t"]
     value: Array = finding.picture["value"]
     limit = float(finding.picture["limit"])
@@ -350,7 +350,7 @@ def range_figure(finding: Finding) -> Figure:
 
 
 def signals_figure(finding: Finding, recording: Recording, vessel: Vessel) -> Figure:
-    """Draw the channels at fault as they are, where nothing better can be drawn."""
+    """Draw the channels of a finding as logged, where no clearer picture exists."""
     names = [n for n in (finding.channels or (finding.channel,)) if n in recording][:4]
     names = names or [n for n in (*MOTION, *vessel.commands) if n in recording][:1]
     names = names or [s.name for s in recording.signals[:1]]
@@ -367,7 +367,7 @@ def signals_figure(finding: Finding, recording: Recording, vessel: Vessel) -> Fi
 
 
 def _axes(title: str, three: bool = False) -> tuple[Figure, Any, Any, Any]:
-    """Return the whole signal above, closer below, and a third pair of axes beside."""
+    """Return axes for the whole signal above, for a close-up below, and for a third picture."""
     figure = new_figure(10, 5.0)
     grid = figure.add_gridspec(2, 2, height_ratios=[1, 1.15])
     whole = figure.add_subplot(grid[0, :])

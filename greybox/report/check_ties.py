@@ -356,8 +356,8 @@ def _draw_curve(ax: Any, finding: Finding, tie: Tie) -> None:
     ax.axvline(value, color=VERMILION, linewidth=1.2, label=signed(f"estimate {value:+.2f} s"))
     ax.axvline(0, color=BLACK, linewidth=0.8, linestyle=":")
     ax.set_ylim(bottom=0)
-    late = f"{', '.join(finding.channels)} taken to be late by [s]"
-    label_axes(ax, late, "disagreement [% of that as logged]")
+    taken = f"{', '.join(finding.channels)} taken to be late by [s]"
+    label_axes(ax, taken, "disagreement [% of that as logged]")
     legend_above(ax, side="center", columns=2, columnspacing=1.0, handlelength=1.6)
 
 
@@ -423,5 +423,5 @@ def _draw_angles(ax: Any, finding: Finding, tie: Tie) -> None:
     ax.set_xlim(0, 360)
     ax.set_xticks(range(0, 361, 90))
     label_axes(ax, "heading [deg]", "direction of u, v and ψ − direction of the track [deg]")
-    close: dict[str, float] = {"columnspacing": 1.0, "handletextpad": 0.3, "markerscale": 3}
+    close: dict[str, Any] = {"columnspacing": 1.0, "handletextpad": 0.3, "markerscale": 3}
     legend_above(ax, side="center", columns=3, **close)

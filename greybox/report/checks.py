@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,16 @@ from greybox.trial.raw_log import Recording
 from greybox.trial.segments import join_segments
 from greybox.vessel.vessel import Vessel
 
+# by the id of a finding, or by what its picture holds
+_OF_LOG: dict[str, Callable[[Finding, Recording], Figure]] = {
+    "gap": gap_figure, "nan": missing_figure, "stuck": stuck_figure,
+}  # fmt: skip
+_ALONE: dict[str, Callable[[Finding], Figure]] = {
+    "duplicate_time": order_figure, "time_format": fractions_figure, "outlier": spike_figure,
+    "heading_wrap": wrap_figure, "position_hold": hold_figure, "position_jump": jump_figure,
+    "quantised": coarse_figure, "actuator": actuator_figure, "external_force": force_figure,
+    "limit": range_figure, "air": wind_figure, "push": answer_figure, "drift": course_figure,
+}  # fmt: skip
 # what makes a force model wrong before what it only has to do without
 _SERIOUS = (
     "frame", "sign", "unit", "clock_offset", "heading_bias", "lever_arm", "time_format",
@@ -220,39 +230,11 @@ def _drawn(finding: Finding, report: CheckReport, vessel: Vessel) -> tuple[Figur
             f"the report of '{report.name}' holds no recording to draw: make it with "
             f"check_recording or check_files."
         )
-    picture = finding.picture
-    if finding.id == "gap":
-        return gap_figure(finding, recording), ""
-    if finding.id == "duplicate_time":
-        return order_figure(finding), ""
-    if finding.id == "time_format":
-        return fractions_figure(finding), ""
-    if finding.id == "nan":
-        return missing_figure(finding, recording), ""
-    if finding.id == "outlier":
-        return spike_figure(finding), ""
-    if finding.id == "heading_wrap":
-        return wrap_figure(finding), ""
-    if finding.id == "position_hold":
-        return hold_figure(finding), ""
-    if finding.id == "position_jump":
-        return jump_figure(finding), ""
-    if finding.id == "stuck":
-        return stuck_figure(finding, recording), ""
-    if finding.id == "quantised":
-        return coarse_figure(finding), ""
-    if finding.id == "actuator":
-        return actuator_figure(finding), ""
-    if finding.id == "external_force":
-        return force_figure(finding), ""
-    if "limit" in picture:
-        return range_figure(finding), ""
-    if "air" in picture:
-        return wind_figure(finding), ""
-    if "push" in picture:
-        return answer_figure(finding), ""
-    if "drift" in picture:
-        return course_figure(finding), ""
+    for name in (finding.id, *finding.picture):
+        if name in _OF_LOG:
+            return _OF_LOG[name](finding, recording), ""
+        if name in _ALONE:
+            return _ALONE[name](finding), ""
     tie = make_tie(finding, report, vessel)
     if tie is None:
         return signals_figure(finding, recording, vessel), ""

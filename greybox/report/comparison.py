@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,9 @@ from greybox.report.figures import comparison_figure, percent, to_svg, told_fits
 from greybox.report.next_steps import after_comparison
 from greybox.report.page import Page, Picture, Table, computed
 from greybox.report.thinning import points_for
-from greybox.validation.bands import LEVEL
+from greybox.validation.bands import LEVEL, Bands
 from greybox.validation.comparison import Comparison, rmse_titles
-from greybox.validation.fit import mean_fit
+from greybox.validation.fit import LogFit, mean_fit
 
 # with more the page grows and tells nothing new
 MOST_LOGS = 8
@@ -157,20 +158,27 @@ def _pictures(comparison: Comparison) -> list[Picture]:
         fits = "; ".join(
             f"{name} {told_fits(run.fit)}" for name, run in zip(comparison.names, runs, strict=True)
         )
-        printed, zoomed = (
-            comparison_figure(comparison.names, runs, bands, points=points_for(curves, **room))
-            for room in ({}, {"most": 10_000, "room": 120_000})
-        )
-        pictures.append(
-            Picture(
-                to_svg(printed, f"log{i}{first.log.name}"),
-                caption,
-                f"{caption} Fit of the free run: {fits}.",
-                narrow=drawn > 1,
-                chart=chart_of(zoomed),
-            )
-        )
+        key, told = f"log{i}{first.log.name}", f"Fit of the free run: {fits}."
+        picture = run_picture(comparison.names, runs, bands, curves, key, caption, told)
+        pictures.append(replace(picture, narrow=drawn > 1))
     return pictures
+
+
+def run_picture(
+    names: Sequence[str],
+    runs: Sequence[LogFit],
+    bands: Sequence[Bands | None],
+    curves: int,
+    key: str,
+    caption: str,
+    told: str,
+) -> Picture:
+    """Return free runs on one log, of a page with so many curves: light in print, finer zoomed."""
+    printed, zoomed = (
+        comparison_figure(names, runs, bands, points=points_for(curves, **room))
+        for room in ({}, {"most": 10_000, "room": 120_000})
+    )
+    return Picture(to_svg(printed, key), caption, f"{caption} {told}", chart=chart_of(zoomed))
 
 
 def _left_out(comparison: Comparison) -> list[str]:

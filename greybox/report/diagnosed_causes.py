@@ -9,7 +9,8 @@ import numpy as np
 from greybox.diagnosis.causes import known_causes
 from greybox.diagnosis.result import Diagnosis, DiagnosisVerdict, Found
 from greybox.notebook import with_error
-from greybox.report.diagnosis_figures import narrow, ranked_for_picture, ranking_figure
+from greybox.report.diagnosis_figures import ranked_for_picture, ranking_figure
+from greybox.report.figures import narrow
 from greybox.report.model_difference import shown_unit, unbroken
 from greybox.report.page import Picture, Section, Table
 
@@ -91,7 +92,7 @@ def _falls(cause: Found) -> list[str]:
 
 
 def probability(p: float) -> str:
-    """Return a p-value as text; no test is exact enough for the last of many powers."""
+    """Return a p-value as text, without the digits of one that rounding decides."""
     return unbroken(f"{p:.2g}" if p >= 1e-16 else "below 1e-16")
 
 

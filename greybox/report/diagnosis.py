@@ -15,7 +15,6 @@ from greybox.report.diagnosis_figures import (
     gain_figure,
     heading_figure,
     most_followed,
-    narrow,
     regime_figure,
     run_figure,
     speed_figure,
@@ -27,7 +26,7 @@ from greybox.report.error_budget import (
     largest,
     noise_sentence,
 )
-from greybox.report.figures import NAMES, percent
+from greybox.report.figures import NAMES, narrow, percent
 from greybox.report.free_run_errors import REGIMES, Errors, gather, simulations
 from greybox.report.model_difference import (
     coefficient_table,
@@ -35,7 +34,7 @@ from greybox.report.model_difference import (
     other_changes,
 )
 from greybox.report.next_steps import NextStep
-from greybox.report.page import Page, Picture, Section, Table, computed
+from greybox.report.page import Page, Picture, Section, Table, capital, computed
 from greybox.report.thinning import points_for
 
 _UNITS = {"u": "m/s", "v": "m/s", "r": "rad/s", "psi": "rad"}
@@ -69,7 +68,7 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
     headline = _headline(diagnosis)
     return Page(
         title="What the simulation gets wrong, and why",
-        headline=headline[:1].upper() + headline[1:],
+        headline=capital(headline),
         sentences=_summary(diagnosis),
         sections=sections,
         lead=lead,
@@ -98,7 +97,7 @@ def _headline(diagnosis: Diagnosis) -> str:
 def _step(told: str) -> NextStep:
     """Return a step with its command apart from the words before it."""
     purpose, _, command = told.rstrip(".").partition(": greybox ")
-    return NextStep(purpose[:1].upper() + purpose[1:], f"greybox {command}" if command else "")
+    return NextStep(capital(purpose), f"greybox {command}" if command else "")
 
 
 def _summary(diagnosis: Diagnosis) -> list[str]:
@@ -289,7 +288,7 @@ def gain_section(diagnosis: Diagnosis) -> Section:
     on = diagnosis.validated_on
     picture = narrow(gain_figure(diagnosis.gain), "gain", caption, f"{caption} {told}.")
     return Section(
-        "4. The gain", [on[:1].upper() + on[1:].rstrip(".") + "."] if on else [],
+        "4. The gain", [capital(on).rstrip(".") + "."] if on else [],
         [picture] if _changed(diagnosis) else [], tables,
     )  # fmt: skip
 

@@ -11,7 +11,6 @@ from matplotlib.ticker import MaxNLocator, SymmetricalLogLocator
 from numpy.typing import NDArray
 
 from greybox.diagnosis.result import Gain, Ranked, Runs
-from greybox.report.chart import Chart
 from greybox.report.error_profiles import Profile, profile
 from greybox.report.figures import (
     BLACK,
@@ -22,10 +21,8 @@ from greybox.report.figures import (
     label_axes,
     legend_outside,
     new_figure,
-    to_svg,
 )
 from greybox.report.free_run_errors import REGIMES, Errors, simulated, simulations
-from greybox.report.page import Picture
 from greybox.report.thinning import find_gaps, pick, thin
 
 Array = NDArray[np.float64]
@@ -332,10 +329,3 @@ def _few_decades(ax: Any, values: Array, lows: Array) -> None:
     locator = SymmetricalLogLocator(base=10, linthresh=_LINEAR)
     locator.set_params(numticks=7)
     ax.xaxis.set_major_locator(locator)
-
-
-def narrow(
-    figure: Figure, name: str, caption: str, alternative: str, chart: Chart | None = None
-) -> Picture:
-    """Return a figure as a picture that stands beside others."""
-    return Picture(to_svg(figure, name), caption, alternative, narrow=True, chart=chart)

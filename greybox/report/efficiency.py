@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from greybox.report.figures import COLOURS, new_figure, tidy, to_svg
-from greybox.report.page import Page, Picture, Table, computed
-from greybox.report.studies import StudyOutput
+from greybox.report.figures import COLOURS, new_figure, tidy
+from greybox.report.page import Page, Table, computed
+from greybox.report.studies import StudyOutput, columns, pictures_of
 from greybox.study.efficiency import CaseResult, Efficiency, Share
 
 _MARKERS = ("o", "s", "D", "^")
@@ -97,10 +97,7 @@ def efficiency_output(study: Efficiency, record: dict[str, Any]) -> StudyOutput:
         ]  # fmt: skip
         caption = f"{result.case.name}: efficiency by determinant, p-th root, 95 % interval"
         tables.append(Table(caption, head, rows))
-        widths = (14, 24, 24, 28, 26, 6)
-        lines.append(result.case.name)
-        for cells in (head, *rows):
-            lines.append("  " + "".join(f"{c:<{w}}" for c, w in zip(cells, widths, strict=True)))
+        lines += [result.case.name, *columns(head, rows)]
         tables.append(_parameters(result, single))
         last = result.case.estimators[-1]
         reached = result.determinant(last, result.cramer_rao)
@@ -123,7 +120,7 @@ def efficiency_output(study: Efficiency, record: dict[str, Any]) -> StudyOutput:
             "being unknown; best IV is the bound of one-step equations with instruments that "
             "depend on the inputs only."
         ],
-        pictures=[Picture(to_svg(f, n), c) for n, (f, c) in figures.items()],
+        pictures=pictures_of(figures),
         tables=tables,
         computed=computed(record),
     )

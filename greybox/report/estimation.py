@@ -22,7 +22,7 @@ from greybox.estimation.tried import Comparison
 from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult, TrustLevel
 from greybox.model.terms import parameter_unit
-from greybox.report.chart import chart_of
+from greybox.report.comparison import run_picture
 from greybox.report.estimation_figures import (
     MOST_DRAWN,
     REACH,
@@ -34,19 +34,18 @@ from greybox.report.estimation_figures import (
     tried_figure,
     visited_figure,
 )
-from greybox.report.figures import NAMES, comparison_figure, to_svg, told_fits
-from greybox.report.model_difference import shown_unit
+from greybox.report.figures import NAMES, narrow, to_svg, told_fits
+from greybox.report.model_difference import shown_unit, unbroken
 from greybox.report.next_steps import after_estimate
-from greybox.report.page import Page, Picture, Section, Table, computed
+from greybox.report.page import Page, Picture, Section, Table, capital, computed
 from greybox.report.physical import physical_summary
-from greybox.report.thinning import points_for
 from greybox.selection.structures import StructureChoice
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import mean_fit, run_model
 
 Array = NDArray[np.float64]
 
-_OUTCOMES = {True: "passed", False: "speaks against it", None: "tells"}
+_OUTCOMES = {True: "passed", False: "speaks against it", None: "for information"}
 # logs that are drawn against time: with more the page grows and tells nothing new
 _MOST_LOGS = 3
 _MOST_PAIRS = 3
@@ -127,7 +126,7 @@ def _prediction(estimate: Estimate) -> list[Table]:
         return []
     head, rows = prediction.rows()
     caption = f"What the free run is good for: on {prediction.judged_words}"
-    return [Table(caption, head, [[c.replace("e-", "e−") for c in row] for row in rows])]
+    return [Table(caption, head, [[unbroken(c) for c in row] for row in rows])]
 
 
 def _summary(estimate: Estimate) -> list[str]:
@@ -169,19 +168,9 @@ def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> tuple[Picture, Section
             f"Free run on {log.name} ({len(log)} samples of {log.sample_time:g} s), a log the "
             f"model was estimated on: measured, simulated, and their difference below."
         )
-        printed, zoomed = (
-            comparison_figure(["model"], [run], points=points_for(curves, **room))
-            for room in ({}, {"most": 10_000, "room": 120_000})
-        )
-        pictures.append(
-            Picture(
-                to_svg(printed, f"run{i}"),
-                caption,
-                f"{caption} Fit: {told_fits(run.fit, 0)}.",
-                narrow=len(drawn) > 1,
-                chart=chart_of(zoomed),
-            )
-        )
+        told = f"Fit: {told_fits(run.fit, 0)}."
+        picture = run_picture(["model"], [run], [], curves, f"run{i}", caption, told)
+        pictures.append(replace(picture, narrow=len(drawn) > 1))
     several = len(logs) > 1
     told = f"The model was fitted to {'these logs' if several else 'this log'}, so the free run "
     told += "shows what it cannot follow, not how well it predicts"
@@ -217,16 +206,13 @@ def _parameters(predicts: Estimate) -> Section:
         for n, v, s in zip(labels, theta, std, strict=True)
     )
     pictures = [
-        Picture(
-            to_svg(
-                forest_figure(
-                    with_unit, theta, np.where(known, std, 0.0), sets, estimate.verdict.excepted
-                ),
-                "forest",
+        narrow(
+            forest_figure(
+                with_unit, theta, np.where(known, std, 0.0), sets, estimate.verdict.excepted
             ),
+            "forest",
             caption,
             f"Intervals of the parameters relative to their values: {worst}.",
-            narrow=True,
         )
     ]
     told = []
@@ -235,12 +221,12 @@ def _parameters(predicts: Estimate) -> Section:
         correlation = covariance / np.outer(std, std)
         told = _pairs(labels, correlation)
         pictures.append(
-            Picture(
-                to_svg(correlation_figure(labels, correlation), "correlation"),
+            narrow(
+                correlation_figure(labels, correlation),
+                "correlation",
                 "Which estimates move together: a strong correlation means that the log tells "
                 "the two apart badly. Beyond ±0.9 the sign is written.",
                 f"Map of the correlations between {len(labels)} estimates. {' '.join(told)}",
-                narrow=True,
             )
         )
     told += [f"{BOUNDS[name]}: {limit.sentence}" for name, limit in estimate.limits.items()]
@@ -298,7 +284,7 @@ def _parameter_table(estimate: EstimateValues) -> Table:
             f"{value / estimate.sample_time:.4g}", unit,
             "not to rely on" if name in estimate.verdict.excepted else "",
         ]  # fmt: skip
-        rows.append([cell.replace("e-", "e−") for cell in row[:-2]] + row[-2:])
+        rows.append([unbroken(cell) for cell in row[:-2]] + row[-2:])
     return Table(
         f"Parameters per sample of {estimate.sample_time:g} s, and per second",
         [
@@ -358,11 +344,10 @@ def _visited(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
     if margins:
         caption += " Shaded: cut out, too near to zero."
     pictures = [
-        Picture(
-            to_svg(visited_figure(values, margins), "visited"), caption,
-            f"{caption} {ranges} (m/s, rad/s).", narrow=True,
+        narrow(
+            visited_figure(values, margins), "visited", caption, f"{caption} {ranges} (m/s, rad/s)."
         )
-    ]  # fmt: skip
+    ]
     if "u" in values and "v" in values:
         shares = ", ".join(
             f"{n} {100 * s:.0f} %" for n, s in regime_shares(values["u"], values["v"]).items()
@@ -371,12 +356,8 @@ def _visited(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
             "Surge against sway with the share of the time in each combination of signs: a "
             "parameter of |u|u or |v|v is only known where the ship was."
         )
-        pictures.append(
-            Picture(
-                to_svg(regimes_figure(values["u"], values["v"]), "regimes"), caption,
-                f"{caption} {shares}.", narrow=True,
-            )
-        )  # fmt: skip
+        figure = regimes_figure(values["u"], values["v"])
+        pictures.append(narrow(figure, "regimes", caption, f"{caption} {shares}."))
     told = [
         _sentence(f"{NAMES.get(s, s)}: {t.sentence}")
         for s in states
@@ -395,9 +376,7 @@ def _margins(estimate: Estimate) -> dict[str, float]:
 
 
 def _sentence(text: str) -> str:
-    # a capital of another alphabet would be another symbol
-    first = text[:1].upper() if text[:1].isascii() else text[:1]
-    return first + text[1:] + ("" if text.endswith(".") else ".")
+    return capital(text) + ("" if text.endswith(".") else ".")
 
 
 def _tests(estimate: EstimateValues) -> Section:
@@ -409,8 +388,8 @@ def _tests(estimate: EstimateValues) -> Section:
             [
                 [
                     t.name.replace("_", " "),
-                    "" if t.statistic is None else f"{t.statistic:.3g}".replace("e-", "e−"),
-                    "" if t.p_value is None else f"{t.p_value:.2g}".replace("e-", "e−"),
+                    "" if t.statistic is None else unbroken(f"{t.statistic:.3g}"),
+                    "" if t.p_value is None else unbroken(f"{t.p_value:.2g}"),
                     "does not apply" if t.obstacle is not None else _OUTCOMES[t.passed],
                     _sentence(t.sentence),
                 ]
@@ -454,8 +433,7 @@ def _tried_picture(compared: Comparison, place: int) -> list[Picture]:
     if len(scores) > MOST_DRAWN:
         caption += f" Of {len(scores)} the best {MOST_DRAWN} are drawn; all are in the table."
     every = "; ".join(f"{r.label}: {r.result}" for r in scores)
-    figure = to_svg(tried_figure(compared), f"tried{place}")
-    return [Picture(figure, caption, f"{caption} {every}.", narrow=True)]
+    return [narrow(tried_figure(compared), f"tried{place}", caption, f"{caption} {every}.")]
 
 
 def _equations(estimate: Estimate, mass: float | None) -> Section:

@@ -14,6 +14,8 @@ from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from greybox.report.chart import Chart
+from greybox.report.page import Picture
 from greybox.report.thinning import find_gaps, pick, thin
 from greybox.validation.bands import Bands
 from greybox.validation.fit import LogFit
@@ -376,6 +378,13 @@ def to_svg(figure: Figure, title: str) -> str:
     text = _PLACES.sub(lambda found: _LONG.sub(_rounded, found[0]), text)
     text = re.sub(r"\s*\n\s*", " ", text).replace("DejaVuSans-", "")
     return _lighter(text, re.sub(r"\W", "", title)[:24])
+
+
+def narrow(
+    figure: Figure, name: str, caption: str, alternative: str = "", chart: Chart | None = None
+) -> Picture:
+    """Return a figure as a picture that stands beside others."""
+    return Picture(to_svg(figure, name), caption, alternative, narrow=True, chart=chart)
 
 
 def _lighter(text: str, prefix: str) -> str:

@@ -23,9 +23,9 @@ from greybox.report.figures import (
     tidy,
     to_svg,
 )
-from greybox.report.model_difference import shown_unit
+from greybox.report.model_difference import shown_unit, unbroken
 from greybox.report.next_steps import after_fleet
-from greybox.report.page import Page, Picture, Section, Table, computed
+from greybox.report.page import Page, Picture, Section, Table, capital, computed
 
 Array = NDArray[np.float64]
 
@@ -51,22 +51,18 @@ def fleet_page(fleet: Fleet, record: Mapping[str, Any]) -> Page:
     sections = [_class_section(fleet), _ships_section(fleet), _time_section(fleet)]
     return Page(
         title=f"{len(fleet.ships)} ships of one class: what they share and which one differs",
-        headline=f"{verdict[0].upper()}{verdict[1:]}.",
+        headline=f"{capital(verdict)}.",
         sentences=[
             *(f"Caution: {c}." for c in fleet.cautions),
-            *(_capital(fleet.difference_sentence(c)) for c in fleet.differing),
+            *(capital(fleet.difference_sentence(c)) for c in fleet.differing),
             f"Every ship was estimated in the same way: {fleet.model.sentence}",
-            *(_capital(one.sentence) for one in fleet.left_out),
+            *(capital(one.sentence) for one in fleet.left_out),
         ],
         lead=_map(fleet),
         next_steps=after_fleet(fleet, record),
         sections=[s for s in sections if s is not None],
         computed=computed(dict(record)),
     )
-
-
-def _capital(sentence: str) -> str:
-    return sentence[:1].upper() + sentence[1:]
 
 
 def _deviations(fleet: Fleet) -> Array:
@@ -119,7 +115,7 @@ def _map(fleet: Fleet) -> Picture:
 
 
 def _number(value: float, digits: str = ".4g") -> str:
-    return f"{value:{digits}}".replace("e-", "e−")
+    return unbroken(f"{value:{digits}}")
 
 
 def _class_section(fleet: Fleet) -> Section:

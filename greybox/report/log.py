@@ -236,9 +236,9 @@ def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock, points: int)
                 # the label of the axis names the only line
                 handles, labels = handles[1:], labels[1:]
             labels = [shorten(label, _LONGEST_LABEL) for label in labels]
-            look = {"borderaxespad": 0.1, "handlelength": 1.6, "columnspacing": 1.2}
+            look: dict[str, Any] = {"borderaxespad": 0.1, "handlelength": 1.6}
             columns = legend_columns(labels, _PHONE)
-            legend_above(ax, handles, labels, columns=columns, **look)
+            legend_above(ax, handles, labels, columns=columns, columnspacing=1.2, **look)
     if axes:
         axes[0].figure.align_ylabels(axes)
         axes[-1].set_xlabel(f"time from the first sample [{clock.unit}]", fontsize=9)

@@ -217,27 +217,16 @@ def after_fleet(fleet: Fleet, record: Mapping[str, Any]) -> list[NextStep]:
 
     odd = [fleet.ships[c.unit].name for c in fleet.differing]
     changing = list(dict.fromkeys(c.ship for c in fleet.changes()))
+    out = [one.ship for one in fleet.left_out]
+    causes = "before hull or propeller are blamed"
     steps = [
-        NextStep(
-            f"See whether sensors or the vessel file make '{ship}' differ",
-            f"greybox check {files(ship)} --report check.html",
+        NextStep(purpose.format(ships[0]), f"greybox check {files(ships[0])} --report check.html")
+        for purpose, ships in (
+            ("See whether sensors or the vessel file make '{}' differ", odd),
+            (f"See whether a sensor of '{{}}' changed, {causes}", changing),
+            ("See what is wrong with the logs of '{}', which was left out", out),
         )
-        for ship in odd[:1]
-    ]
-    steps += [
-        NextStep(
-            f"See whether a sensor of '{ship}' changed, before hull or propeller are blamed",
-            f"greybox check {files(ship)} --report check.html",
-        )
-        for ship in changing[:1]
-        if ship not in odd
-    ]
-    steps += [
-        NextStep(
-            f"See what is wrong with the logs of '{one.ship}', which was left out",
-            f"greybox check {files(one.ship)} --report check.html",
-        )
-        for one in fleet.left_out[:1]
+        if ships and not (ships is changing and ships[0] in odd)
     ]
     first = (odd or [fleet.ships[0].name])[0]
     steps.append(

@@ -301,6 +301,11 @@ def _policy(scripts: Sequence[str]) -> str:
     )
 
 
+def capital(text: str) -> str:
+    """Return a sentence with a capital; one of another alphabet would be another symbol."""
+    return text[:1].upper() + text[1:] if text[:1].isascii() else text
+
+
 def write_page(page: Page, path: str | Path) -> None:
     """Write the page, replacing the file in one step."""
     write_text(render(page), path)

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from greybox.files import write_text
-from greybox.report.figures import COLOURS, new_figure, tidy, to_svg
-from greybox.report.page import Page, Picture, Table, computed
-from greybox.report.studies import StudyOutput, write_output
+from greybox.report.figures import COLOURS, new_figure, tidy
+from greybox.report.page import Page, Table, computed
+from greybox.report.studies import StudyOutput, columns, pictures_of
 from greybox.study.blind_causes import CAUSES
 from greybox.study.power import ANSWERS, LEAST_FALL, Cell, Power, Share
 
@@ -38,7 +36,7 @@ def _of_visible(study: Power, *cells: Cell) -> Share:
 
 def _power_table(study: Power, kind: str) -> Table:
     head = ["what is wrong", "size", "found", "named rightly", "in a group", "part", "wrong",
-            "failed", "trials", "rightly, of those to be found"]  # fmt: skip
+            "failed", "trials", f"rightly, if errors fall by {100 * LEAST_FALL:g} %"]  # fmt: skip
     rows = [
         [
             cell.label,
@@ -181,11 +179,7 @@ def power_output(study: Power, record: dict[str, Any]) -> StudyOutput:
     tables = [_power_table(study, kind) for kind in _kinds(study)]
     lines = []
     for table in tables:
-        width = [max(len(str(r[i])) for r in (table.header, *table.rows)) + 2
-                 for i in range(len(table.header))]  # fmt: skip
-        lines.append(table.caption)
-        for cells in (table.header, *table.rows):
-            lines.append("  " + "".join(f"{c:<{w}}" for c, w in zip(cells, width, strict=True)))
+        lines += [table.caption, *columns(table.header, table.rows)]
     figures = {}
     sizes = _sizes(study)
     if sizes:
@@ -213,11 +207,12 @@ def power_output(study: Power, record: dict[str, Any]) -> StudyOutput:
             "Trials are drawn from a seed and sailed by a simulator of their own; the judge sees "
             "logs and vessel. A group counts as right when it holds every true cause."
         ],
-        pictures=[Picture(to_svg(f, n), c) for n, (f, c) in figures.items()],
+        pictures=pictures_of(figures),
         tables=tables,
         computed=computed(record),
     )
-    return StudyOutput("\n".join([*lines, *sentences]), study.rows(), figures, page)
+    text = "\n".join([*lines, *sentences])
+    return StudyOutput(text, study.rows(), figures, page, {"shares.csv": shares_csv(study)})
 
 
 def shares_csv(study: Power) -> str:
@@ -234,11 +229,3 @@ def shares_csv(study: Power) -> str:
                  f"{share.value:.6g}", f"{low:.6g}", f"{high:.6g}"]
             )  # fmt: skip
     return out.getvalue()
-
-
-def write_power(study: Power, record: dict[str, Any], folder: str | Path) -> StudyOutput:
-    """Write tables.csv, shares.csv with 95 % intervals, figures and page; return the output."""
-    output = power_output(study, record)
-    write_output(output, folder)
-    write_text(shares_csv(study), Path(folder) / "shares.csv")
-    return output

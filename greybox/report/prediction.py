@@ -14,9 +14,11 @@ from greybox.estimation.verdict import TrustLevel
 from greybox.prediction.measuring import LABELS
 from greybox.prediction.monte_carlo import MonteCarloQuantity
 from greybox.prediction.result import (
+    TITLES,
     WORDS,
     ManoeuvrePrediction,
     PredictedManoeuvre,
+    limit_words,
     verdict_line,
 )
 from greybox.report.figures import (
@@ -29,17 +31,11 @@ from greybox.report.figures import (
     to_svg,
 )
 from greybox.report.next_steps import after_prediction
-from greybox.report.page import Page, Picture, Section, Table, computed
+from greybox.report.page import Page, Picture, Section, Table, capital, computed
 from greybox.trial.manoeuvres import Compliance
 
 Array = NDArray[np.float64]
 
-_TITLES = {
-    "turning": "turning circle",
-    "zigzag": "zig-zag",
-    "stopping": "stop without thrust",
-    "crash": "crash stop",
-}
 _DEGREES = 180 / math.pi
 
 _DOUBTS = {
@@ -54,12 +50,12 @@ def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any], vessel: s
     lead, *others = sections[0].pictures
     sections[0] = replace(sections[0], pictures=others)
     return Page(
-        title=f"{made.vessel}: predicted {_TITLES[made.kind]}",
+        title=f"{made.vessel}: predicted {TITLES[made.kind]}",
         headline=headline(made),
-        sentences=[f"{made.steering[0].upper()}{made.steering[1:]}."],
+        sentences=[f"{capital(made.steering)}."],
         sections=[
             *sections,
-            *([Section("Notes on these numbers", points=_points(made.notes))]
+            *([Section("Notes on these numbers", points=list(map(capital, made.notes)))]
               if made.notes else []),
         ],
         lead=replace(lead, caption=f"{sections[0].title}: {lead.caption}"),
@@ -107,27 +103,19 @@ def headline(made: ManoeuvrePrediction) -> str:
     return f"{told} But {' and '.join(doubts)}." if doubts else told
 
 
-def _points(notes: tuple[str, ...]) -> list[str]:
-    return [n[0].upper() + n[1:] for n in notes]
-
-
 def _section(made: PredictedManoeuvre, key: str) -> Section:
-    sentences = [] if made.agreement is None else [_capital(made.agreement.sentence)]
+    sentences = [] if made.agreement is None else [capital(made.agreement.sentence)]
     tables = [_values(made)]
     if made.agreement is not None and made.agreement.rows:
         tables.append(_beside(made))
     return Section(
-        _capital(made.label),
+        capital(made.label),
         sentences=sentences,
         pictures=_pictures(made, key),
         tables=tables,
-        points=[*[_capital(f"IMO {verdict_line(c)}.") for c in made.criteria],
-                *_points(made.notes)],
+        points=[*[capital(f"IMO {verdict_line(c)}.") for c in made.criteria],
+                *map(capital, made.notes)],
     )  # fmt: skip
-
-
-def _capital(text: str) -> str:
-    return text[0].upper() + text[1:]
 
 
 def _values(made: PredictedManoeuvre) -> Table:
@@ -143,12 +131,7 @@ def _values(made: PredictedManoeuvre) -> Table:
         criterion = made.criterion(name)
         limit = verdict = ""
         if criterion is not None:
-            verdict = WORDS[criterion.verdict]
-            if criterion.limit is not None:
-                angle = criterion.measured is not None and criterion.measured.unit == "rad"
-                limit = (
-                    f"{criterion.limit * _DEGREES:.1f} deg" if angle else f"{criterion.limit:g} L"
-                )
+            limit, verdict = limit_words(criterion), WORDS[criterion.verdict]
         rows.append([LABELS[name], *_cells(value, made.length), limit, verdict])
     return Table(
         "Predicted, with intervals of 95 %",

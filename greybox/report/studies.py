@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,16 +28,17 @@ from greybox.study.tables import Row, to_csv
 
 @dataclass(frozen=True)
 class StudyOutput:
-    """What a study hands over: text for the terminal, rows, figures by file name, a page."""
+    """Results of a study: text for the terminal, rows, figures and texts by file name, a page."""
 
     text: str
     rows: Sequence[Row]
     figures: dict[str, tuple[Figure, str]]
     page: Page
+    texts: Mapping[str, str] = field(default_factory=dict)
 
 
 def write_output(output: StudyOutput, folder: str | Path) -> None:
-    """Write tables.csv, one PNG a figure, and report.html into a folder.
+    """Write tables.csv, one PNG a figure, the study's own texts and report.html into a folder.
 
     Raises
     ------
@@ -45,7 +46,8 @@ def write_output(output: StudyOutput, folder: str | Path) -> None:
         The folder cannot be made.
     """
     folder = make_folder(folder)
-    write_text(to_csv(output.rows), folder / "tables.csv")
+    for name, text in {"tables.csv": to_csv(output.rows), **output.texts}.items():
+        write_text(text, folder / name)
     for name, (figure, _) in output.figures.items():
         save_png(figure, str(folder / f"{name}.png"))
     write_page(output.page, folder / "report.html")
@@ -90,7 +92,17 @@ def _table(caption: str, rows: Sequence[Row]) -> Table:
     )
 
 
-def _pictures(figures: dict[str, tuple[Figure, str]]) -> list[Picture]:
+def columns(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table of text, each column as wide as its longest cell."""
+    widths = [max(map(len, cells)) + 2 for cells in zip(head, *rows, strict=True)]
+    return [
+        "  " + "".join(f"{cell:<{width}}" for cell, width in zip(cells, widths, strict=True))
+        for cells in (head, *rows)
+    ]
+
+
+def pictures_of(figures: dict[str, tuple[Figure, str]]) -> list[Picture]:
+    """Return the figures of a study for its page."""
     return [Picture(to_svg(f, name), caption) for name, (f, caption) in figures.items()]
 
 
@@ -126,7 +138,7 @@ def chapter4_output(result: Chapter4, record: dict[str, Any]) -> StudyOutput:
     page = Page(
         "Chapter 4: eliminating disturbances",
         headline,
-        pictures=_pictures(figures),
+        pictures=pictures_of(figures),
         tables=[_table("Mean ± sd of (estimate − true)/|true|", rows)],
         computed=computed(record),
     )
@@ -187,7 +199,7 @@ def chapter6_output(result: Chapter6, record: dict[str, Any]) -> StudyOutput:
             "estimates shows it did there; the sequence itself is not published, so the biases of "
             "the inconsistent estimators can agree in direction only."
         ],
-        pictures=_pictures(figures),
+        pictures=pictures_of(figures),
         tables=[
             _table(f"Table {t}: normalised errors, mean ± sd", [r for r in rows if r.table == t])
             for t in sorted({r.table for r in rows})
@@ -238,7 +250,7 @@ def chapter7_output(result: Chapter7, record: dict[str, Any]) -> StudyOutput:
         "Chapter 7: experimental study",
         headline,
         sentences=[f"{n} was left out: {why}" for n, why in result.skipped.items()],
-        pictures=_pictures(figures),
+        pictures=pictures_of(figures),
         tables=[
             Table(
                 "Table 7.1: fit on the validation logs [%], mean ± sd over estimation sets",

@@ -85,7 +85,7 @@ def draw_track(axes: Any, log: TrialLog, gaps: NDArray[np.intp], points: int) ->
         )
     handles, labels = axes.get_legend_handles_labels()
     labels += [h.get_label() for h in shown]
-    look = {"borderaxespad": 0.1, "columnspacing": 1.2}
+    look: dict[str, Any] = {"borderaxespad": 0.1, "columnspacing": 1.2}
     legend_above(axes, [*handles, *shown], labels, columns=2, **look)
     axes.set_aspect("equal", adjustable="datalim")
     label_axes(axes, "east [m]", "north [m]")

@@ -11,7 +11,8 @@ import pytest
 from statsmodels.stats.proportion import proportion_confint
 
 from greybox.errors import ExcitationError, UsageError
-from greybox.report.power import shares_csv, write_power
+from greybox.report.power import power_output, shares_csv
+from greybox.report.studies import write_output
 from greybox.study.blind_causes import Effect
 from greybox.study.blind_conditions import Conditions
 from greybox.study.power import Cell, Judgement, Oracle, Outcome, Power, Share, run_power
@@ -132,7 +133,7 @@ def test_failures_are_counted_not_raised(tmp_path):
     study = run_power(failing, effects=[("current",)], sizes=(1.0,), runs=2, none_runs=0,
                       conditions=QUICK, workers=1)  # fmt: skip
     assert study.share(study.cells[0], "failed") == Share(2, 2)
-    write_power(study, {"program": "test"}, tmp_path)
+    write_output(power_output(study, {"program": "test"}), tmp_path)
     assert "turn more" in (tmp_path / "report.html").read_text()
 
 
@@ -151,7 +152,9 @@ def test_more_runs_begin_with_the_same_trials(study):
 
 
 def test_tables_figures_and_page(study, tmp_path):
-    output = write_power(study, {"program": "test"}, tmp_path)
+    output = power_output(study, {"program": "test"})
+    write_output(output, tmp_path)
+    assert (tmp_path / "shares.csv").read_text() == shares_csv(study)
     assert "with nothing wrong, something was found in" in output.text
     lines = (tmp_path / "tables.csv").read_text().splitlines()
     assert lines[0].startswith("table,set,estimator,parameter,mean,sd")
@@ -188,7 +191,7 @@ def test_an_oracle_says_which_trials_count_and_what_was_lost(tmp_path):
     assert 0 < len(found) < 8
     assert study.visible(waves) == found
     assert study.lost(waves) == [2.0] * 8
-    output = write_power(study, {"program": "test"}, tmp_path)
+    output = power_output(study, {"program": "test"})
     share = Share(len(found), len(found) + len(large))
     assert f"by at least 5 %, it was named in {share} of {share.runs} trials" in output.text
 
