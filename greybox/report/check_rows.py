@@ -15,6 +15,7 @@ from greybox.report.figures import (
     GREEN,
     LABELS,
     VERMILION,
+    draw_line,
     label_axes,
     legend_above,
     new_figure,
@@ -88,8 +89,7 @@ def order_figure(finding: Finding) -> Figure:
     high = min(int(wrong[0]) + _ROWS, len(t))
     for ax, part in ((whole, slice(None)), (zoom, slice(low, high))):
         inside = wrong[(rows[wrong] >= rows[part][0]) & (rows[wrong] <= rows[part][-1])]
-        index = thin(np.array([], np.intp), t[part])
-        ax.plot(pick(rows[part], index), pick(t[part], index), color=BLUE, linewidth=1.0)
+        draw_line(ax, rows[part], t[part], np.array([], np.intp), 2000, color=BLUE, linewidth=1.0)
         if ax is zoom:
             ax.plot(rows[part], t[part], ".", color=BLUE, markersize=4)
         inside = inside[:_MOST_MARKS]

@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from greybox.channels import CHANNELS
 from greybox.report.agreement import (
     Agreement,
     Widths,
@@ -31,12 +32,13 @@ from greybox.report.figures import (
     GREEN,
     ORANGE,
     VERMILION,
+    draw_line,
     label_axes,
     legend_above,
     legend_outside,
     new_figure,
 )
-from greybox.report.thinning import find_gaps, pick, thin
+from greybox.report.thinning import find_gaps
 from greybox.trial.checks.finding import CheckReport, Finding
 from greybox.trial.checks.motion import NAMES, Motion, make_motion
 from greybox.trial.raw_log import Recording
@@ -46,7 +48,6 @@ from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
-_UNITS = {"u": "m/s", "v": "m/s", "r": "rad/s"}
 _DOTS = 250
 _LAGS = 41
 _CURVE_SAMPLES = 12_000
@@ -311,12 +312,9 @@ def _draw_pair(
         ):
             shown = np.interp(t[inside], t, value[key])
             gaps = find_gaps(t[inside], tie.motion.step)
-            index = thin(gaps, np.nan_to_num(shown), points=400)
-            ax.plot(
-                pick(t[inside], index), pick(shown, index), style, color=colour, linewidth=1.3,
-                label=text,
-            )  # fmt: skip
-        title = f"{words}:\n{agreement.rms(name):.3g} {_UNITS[name]} apart (RMS)"
+            look: dict[str, Any] = {"linestyle": style, "color": colour, "linewidth": 1.3}
+            draw_line(ax, t[inside], shown, gaps, 400, label=text, **look)
+        title = f"{words}:\n{agreement.rms(name):.3g} {CHANNELS[name].unit} apart (RMS)"
         label_axes(ax, y=label_of(name, None), title=title)
         ax.set_xlim(*span)
         limits.append(ax.get_ylim())

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from greybox.channels import CHANNELS
 from greybox.diagnosis.result import Diagnosis, Gain, Runs, hardly_split
 from greybox.report.chart import chart_of
 from greybox.report.diagnosed_causes import cause_section, probability
@@ -37,7 +38,6 @@ from greybox.report.next_steps import NextStep
 from greybox.report.page import Page, Picture, Section, Table, capital, computed
 from greybox.report.thinning import points_for
 
-_UNITS = {"u": "m/s", "v": "m/s", "r": "rad/s", "psi": "rad"}
 # logs of each kind that are drawn: with more the page grows and tells nothing new
 _MOST_LOGS = 3
 # characters of a verdict that leave room for the next step on the first screen
@@ -223,7 +223,7 @@ def _rms_sentence(errors: Errors) -> str:
     parts = []
     for state in errors.states:
         sizes = ", ".join(f"{errors.rms(name, state):.3g} {name}" for name in errors.error)
-        parts.append(f"{NAMES.get(state, state)} [{_UNITS.get(state, '')}] {sizes}")
+        parts.append(f"{NAMES.get(state, state)} [{CHANNELS[state].unit}] {sizes}")
     return f"Root mean square errors: {'; '.join(parts)}."
 
 

@@ -10,20 +10,24 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, SymmetricalLogLocator
 from numpy.typing import NDArray
 
+from greybox.channels import CHANNELS
 from greybox.diagnosis.result import Gain, Ranked, Runs
 from greybox.report.error_profiles import Profile, profile
 from greybox.report.figures import (
     BLACK,
     BLUE,
     LABELS,
+    NAMES,
     SKY,
     VERMILION,
+    draw_line,
     label_axes,
     legend_outside,
     new_figure,
+    run_axes,
 )
 from greybox.report.free_run_errors import REGIMES, Errors, simulated, simulations
-from greybox.report.thinning import find_gaps, pick, thin
+from greybox.report.thinning import find_gaps
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -44,7 +48,7 @@ _STYLE: Mapping[str, dict[str, Any]] = {
     "after": {"color": BLUE, "linestyle": "-", "marker": "o"},
     "simulated": {"color": BLUE, "linestyle": "-", "marker": "o"},
 }
-_SHORT = {"u": "surge [m/s]", "v": "sway [m/s]", "r": "yaw rate [rad/s]", "psi": "heading [rad]"}
+_SHORT = {state: f"{word} [{CHANNELS[state].unit}]" for state, word in NAMES.items()}
 
 
 def run_figure(run: Runs, points: int = _POINTS) -> Figure:
@@ -59,44 +63,23 @@ def run_figure(run: Runs, points: int = _POINTS) -> Figure:
     states = list(run.measured)
     shown = simulations(run)
     figure = new_figure(_WIDTH, 2.35 * len(states) + 0.5)
-    grid = figure.add_gridspec(2 * len(states), 1, height_ratios=[1.6, 1] * len(states))
     t = run.log.t - run.log.t[0]
     gaps = find_gaps(t, run.log.sample_time)
-    first: Any = None
-    for i, state in enumerate(states):
-        top = figure.add_subplot(grid[2 * i], sharex=first)
-        first = first or top
-        below = figure.add_subplot(grid[2 * i + 1], sharex=first)
+    pairs = run_axes(figure, states, _SHORT, "error", 9)
+    for state, (top, below) in zip(states, pairs, strict=True):
         measured = run.measured[state]
         spread = float(np.ptp(measured)) or 1.0
         low, high = measured.min() - 0.6 * spread, measured.max() + 0.6 * spread
-        _line(
-            top, t, measured, gaps, points, {"color": BLACK, "linewidth": 0.9, "label": "measured"}
-        )
+        draw_line(top, t, measured, gaps, points, color=BLACK, linewidth=0.9, label="measured")
         for name in shown:
             style = {k: v for k, v in _STYLE[name].items() if k != "marker"}
             style |= {"linewidth": 1.2, "label": name}
             x = simulated(run, name, state)
-            _line(top, t, np.clip(x, low, high), gaps, points, style)
-            _line(below, t, np.clip(measured - x, -spread, spread), gaps, points, style)
+            draw_line(top, t, np.clip(x, low, high), gaps, points, **style)
+            draw_line(below, t, np.clip(measured - x, -spread, spread), gaps, points, **style)
         below.axhline(0, color=BLACK, linewidth=0.6)
-        unit = _SHORT.get(state, "").partition("[")[2]
-        label_axes(top, y=_SHORT.get(state, state))
-        label_axes(below, y="error" + f"\n[{unit}" * bool(unit))
-        for ax in (top, below):
-            ax.yaxis.set_major_locator(MaxNLocator(4 if ax is top else 3))
-            ax.tick_params(labelbottom=ax is below and i == len(states) - 1)
-        if i == 0:
-            _legend(figure, top)
-    below.set_xlabel("time from the first sample [s]", fontsize=9)
+    _legend(figure, pairs[0][0])
     return figure
-
-
-def _line(
-    axes: Any, t: Array, value: Array, gaps: Index, points: int, style: Mapping[str, Any]
-) -> None:
-    kept = thin(gaps, np.nan_to_num(value), points=points)
-    axes.plot(pick(t, kept), pick(value, kept), **style)
 
 
 def heading_figure(errors: Errors) -> Figure:

@@ -106,6 +106,36 @@ def legend_outside(figure: Figure, axes: Any, place: str, columns: int, **look: 
     )  # fmt: skip
 
 
+def run_axes(
+    figure: Figure, states: Sequence[str], labels: Mapping[str, str], error: str, size: float
+) -> list[tuple[Any, Any]]:
+    """Return for each state axes of a free run, and below them axes of its error."""
+    grid = figure.add_gridspec(2 * len(states), 1, height_ratios=[1.6, 1] * len(states))
+    first: Any = None
+    pairs = []
+    for i, state in enumerate(states):
+        top = figure.add_subplot(grid[2 * i], sharex=first)
+        first = first or top
+        below = figure.add_subplot(grid[2 * i + 1], sharex=first)
+        unit = labels.get(state, "").partition("[")[2]
+        label_axes(top, y=labels.get(state, state))
+        label_axes(below, y=error + f"\n[{unit}" * bool(unit), size=size)
+        for axes in (top, below):
+            axes.yaxis.set_major_locator(MaxNLocator(4 if axes is top else 3))
+            axes.tick_params(labelbottom=axes is below and i == len(states) - 1)
+        pairs.append((top, below))
+    below.set_xlabel("time from the first sample [s]", fontsize=9)
+    return pairs
+
+
+def draw_line(
+    axes: Any, t: Array, value: Array, gaps: NDArray[np.intp], points: int, **style: Any
+) -> None:
+    """Draw a line of about so many points by its envelope, interrupted at gaps."""
+    index = thin(gaps, np.nan_to_num(value), points=points)
+    axes.plot(pick(t, index), pick(value, index), **style)
+
+
 def comparison_figure(
     names: Sequence[str],
     runs: Sequence[LogFit],
@@ -132,14 +162,10 @@ def comparison_figure(
     columns = legend_columns(["measured", *(f"{shorten(n)}: fit 100.0 %" for n in names)], _WIDTH)
     rows = -(-(len(names) + 1) // columns)
     figure = new_figure(_WIDTH, (2.1 + LEGEND_ROW * (rows - 1)) * len(states) + 0.6)
-    grid = figure.add_gridspec(2 * len(states), 1, height_ratios=[1.6, 1] * len(states))
     t = log.t - log.t[0]
     gaps = find_gaps(log.t, log.sample_time)
-    first: Any = None
-    for i, state in enumerate(states):
-        top = figure.add_subplot(grid[2 * i], sharex=first)
-        first = first or top
-        below = figure.add_subplot(grid[2 * i + 1], sharex=first)
+    pairs = run_axes(figure, states, LABELS, "difference", 8)
+    for i, (state, (top, below)) in enumerate(zip(states, pairs, strict=True)):
         measured = log[state]
         index = thin(gaps, measured, points=points)
         top.plot(
@@ -163,8 +189,7 @@ def comparison_figure(
             short = shorten(name)
             label = f"{short}: fit {shown}"
             for axes, value, told in ((top, np.clip(x, low, high), label), (below, error, short)):
-                index = thin(gaps, np.nan_to_num(value), points=points)
-                axes.plot(pick(t, index), pick(value, index), label=told, **style)
+                draw_line(axes, t, value, gaps, points, label=told, **style)
         # a wide band must not flatten what it is drawn about
         view, gap = top.get_ylim(), below.get_ylim()
         for j, (run, band) in enumerate(zip(runs, bands, strict=True)):
@@ -175,16 +200,7 @@ def comparison_figure(
         top.set_ylim(view)
         below.set_ylim(gap)
         below.axhline(0, color=BLACK, linewidth=0.6)
-        unit = LABELS.get(state, "").partition("[")[2]
-        label_axes(top, y=LABELS.get(state, state))
-        label_axes(below, y="difference" + f"\n[{unit}" * bool(unit), size=8)
         legend_above(top, columns=columns, borderaxespad=0.2)
-        for axes in (top, below):
-            axes.yaxis.set_major_locator(MaxNLocator(4 if axes is top else 3))
-        top.tick_params(labelbottom=False)
-        below.tick_params(labelbottom=i == len(states) - 1)
-        if i == len(states) - 1:
-            below.set_xlabel("time from the first sample [s]", fontsize=9)
     figure.align_ylabels()
     figure.suptitle(f"Free run on {shorten(log.name, 50)}", fontsize=10)
     return figure

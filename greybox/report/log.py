@@ -18,13 +18,14 @@ from greybox.report.figures import (
     LEGEND_ROW,
     ORANGE,
     STYLES,
+    draw_line,
     label_axes,
     legend_above,
     legend_columns,
     new_figure,
     shorten,
 )
-from greybox.report.thinning import find_gaps, longest, pick, thin
+from greybox.report.thinning import find_gaps, longest
 from greybox.report.track import draw_track
 from greybox.trial.log import TrialLog
 from greybox.trial.wind import direction_from, true_wind
@@ -248,15 +249,9 @@ def _draw(axes: list[Any], panels: Sequence[_Panel], clock: _Clock, points: int)
 
 def _draw_lines(ax: Any, panel: _Panel, clock: _Clock, points: int) -> None:
     for j, (name, value) in enumerate(panel.lines.items()):
-        index = thin(clock.gaps, value, points=points)
-        ax.plot(
-            pick(clock.time, index),
-            pick(value, index),
-            color=COLOURS[j % 6] if len(panel.lines) > 1 else BLACK,
-            linestyle=STYLES[j % 4],
-            linewidth=0.9,
-            label=name,
-        )
+        colour = COLOURS[j % 6] if len(panel.lines) > 1 else BLACK
+        look: dict[str, Any] = {"color": colour, "linestyle": STYLES[j % 4], "linewidth": 0.9}
+        draw_line(ax, clock.time, value, clock.gaps, points, label=name, **look)
     if panel.kind == "angle":
         ax.yaxis.set_major_locator(_degree_ticks(panel.lines.values()))
 
