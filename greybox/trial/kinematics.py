@@ -55,11 +55,7 @@ def velocities_from_positions(
     Ljungberg (2020), eq. 3.57 (with Rᵀ, from n-frame differences to the body
     frame) and 3.64.
     """
-
-    def rate(value: Array) -> Array:
-        return np.asarray(np.gradient(value, sample_time))
-
-    north, east, r = rate(x_n), rate(y_n), rate(psi)
+    north, east, r = (np.asarray(np.gradient(x, sample_time)) for x in (x_n, y_n, psi))
     rho = np.exp(-(heading_std**2) / 2)
     u, v = (w / rho for w in ned_to_body(north, east, psi))
     return u + r * antenna[1], v - r * antenna[0], r

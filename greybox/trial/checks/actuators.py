@@ -592,10 +592,7 @@ def _estimate(fit: _Fit, pairs: Sequence[_Pair], actuator: Actuator) -> Actuator
     if fit.hold and fit.fresh:
         again = _improve(fit.theta, fit.free, fit.fresh, actuator.kind)
         again = replace(again, covariance=_covariance(again, fit.fresh, actuator.kind))
-        new = (
-            _measured(again, _D, fit.fresh),
-            _measured(again, _T, fit.fresh),
-        )
+        new = _measured(again, _D, fit.fresh), _measured(again, _T, fit.fresh)
     delay = _measured(fit, _D, pairs)
     lag = _measured(fit, _T, pairs)
     response = delay.value + lag.value

@@ -710,7 +710,10 @@ class _Scan:
 
     def events(self) -> list[_Event]:
         """Return the stretches with a force of their own, the clearest first."""
-        found = [e for e in self._held() if self.share(e)[1] > _LEAST_HELD]
+        stood = [
+            _Event(k, a, b - 1, False, None) for k, s in enumerate(self.standing) for a, b in s
+        ]
+        found = [e for e in stood if self.share(e)[1] > _LEAST_HELD]
         for _ in range(_MOST_EVENTS - len(found)):
             event = self._clearest()
             if event is None:
@@ -727,14 +730,6 @@ class _Scan:
                 self.free = before.free
                 break
         return found
-
-    def _held(self) -> list[_Event]:
-        """Return the stretches in which the ship stood."""
-        return [
-            _Event(k, a, b - 1, False, None)
-            for k, stretches in enumerate(self.standing)
-            for a, b in stretches
-        ]
 
     def _allow(self, event: _Event) -> None:
         """Fit a force of its own to a stretch, and all else anew."""

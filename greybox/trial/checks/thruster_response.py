@@ -145,7 +145,8 @@ def _answer(
     motion = _turning_motion(recording)
     if motion is None:
         return None
-    inputs = {c: _held(recording, c, motion.t) for c in vessel.commands}
+    given = {c: orderly(recording[c], angular=False) for c in vessel.commands}
+    inputs = {c: hold(make_clock(s.t), s.value, motion.t) for c, s in given.items()}
     motion, inputs = _open_loop(recording, vessel, motion, inputs)
     if len(motion) < _MIN_SAMPLES:
         return None
@@ -270,11 +271,6 @@ def _picture(
                 "match": tuple(match),
             }
     return shown
-
-
-def _held(recording: Recording, name: str, t: Array) -> Array:
-    s = orderly(recording[name], angular=False)
-    return hold(make_clock(s.t), s.value, t)
 
 
 def _open_loop(

@@ -5,7 +5,7 @@ Time zones between their clocks are found, and what contradicts itself is refuse
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import reduce
@@ -151,16 +151,15 @@ def _refuse_two_states(name: str, parts: list[_Part]) -> None:
                 f"is {wind_state(other.steps)}: they cannot be merged. Import both from their raw "
                 f"files."
             )
-        one, two = (_corrections(of.steps, name) for of in (first, other))
+        one, two = (
+            [s for s in of.steps if s.decided_by == "vessel" and name in s.channels]
+            for of in (first, other)
+        )
         if one != two:
             raise LogError(
                 f"{name} of '{first.name}' is {_in_words(one)}, that of '{other.name}' is "
                 f"{_in_words(two)}: they cannot be merged. Import both from their raw files."
             )
-
-
-def _corrections(steps: Iterable[Step], name: str) -> list[Step]:
-    return [s for s in steps if s.decided_by == "vessel" and name in s.channels]
 
 
 def _in_words(steps: list[Step]) -> str:
@@ -259,7 +258,7 @@ def _shift(
 ) -> float:
     """Return by how much the times of a file must be moved [s]."""
     options = [0.0] if zone is None else [0.0, -zone]
-    best = min(options, key=lambda s: _apart(_moved(span, s), whole))
+    best = min(options, key=lambda s: abs(span[0] + s - whole[0]) + abs(span[1] + s - whole[1]))
     if _overlap(_moved(span, best), whole) > _OVERLAP:
         return best
     names = {n for x in reference for n in x.names}
@@ -296,10 +295,6 @@ def _union(recordings: Sequence[Recording]) -> Span:
 
 def _moved(span: Span, shift: float) -> Span:
     return span[0] + shift, span[1] + shift
-
-
-def _apart(a: Span, b: Span) -> float:
-    return abs(a[0] - b[0]) + abs(a[1] - b[1])
 
 
 def _overlap(a: Span, b: Span) -> float:

@@ -162,20 +162,19 @@ def measure_stopping(
         way = path_length(track, start, when, scale)
         reach = Quantity(way.value, math.hypot(way.std, lost), "m", way.dof)
         along, across = ned_to_body(track.x_n, track.y_n, psi0.value)
-        ends = {}
+        ends = []
         walk = track.walk * (when - start)
-        for name, y in (("along", along), ("across", across)):
+        for y in (along, across):
             one, two = (fit_at(t, y, at, scale, std=track.std) for at in (start, when))
-            ends[name] = (
-                two.value(when) - one.value(start),
+            variance = (
                 one.std(start) ** 2
                 + two.std(when) ** 2
                 + (two.value(when, 1) * slow) ** 2
                 + (one.value(start, 1) * start_std) ** 2
-                + walk,
-                min(one.dof, two.dof),
+                + walk
             )
-        (a, var_a, dof_a), (b, var_b, dof_b) = ends["along"], ends["across"]
+            ends.append((two.value(when) - one.value(start), variance, min(one.dof, two.dof)))
+        (a, var_a, dof_a), (b, var_b, dof_b) = ends
         head = Quantity(a, math.sqrt(var_a + (b * psi0.std) ** 2), "m", min(dof_a, psi0.dof))
         lateral = Quantity(b, math.sqrt(var_b + (a * psi0.std) ** 2), "m", min(dof_b, psi0.dof))
         own = fit_at(t, psi, when, scale, std=heading_std)

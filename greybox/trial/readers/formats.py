@@ -20,11 +20,9 @@ from greybox.trial.readers.topic_files import as_topic
 # third parties add theirs: an entry point named after the ending, without the dot
 GROUP = "greybox.readers"
 
-_TABLES = {
+_KINDS = {
     ".csv": "csv", ".txt": "csv", ".tsv": "csv", ".dat": "csv", "": "csv",
     ".parquet": "parquet", ".pq": "parquet",
-}  # fmt: skip
-_RECORDINGS = {
     ".nmea": "nmea", ".nmea0183": "nmea", ".log": "nmea", ".mat": "mat", ".bag": "ros",
     ".mcap": "ros", ".db3": "ros",
 }  # fmt: skip
@@ -177,14 +175,14 @@ def _kind(path: Path) -> str:
 
     if looks_like_nmea(head):
         return "nmea"
-    kind = {**_TABLES, **_RECORDINGS}.get(suffix, "")
+    kind = _KINDS.get(suffix, "")
     if kind in ("parquet", "ros", "mat") and (kind != "mat" or b"\0" not in head[:4]):
         # a version 4 MATLAB file has no magic, only small integers
         return kind
     if kind == "nmea" and b"$" not in head:
         kind = "csv"
     if not kind:
-        known = sorted(e for e in {**_TABLES, **_RECORDINGS} if e)
+        known = sorted(filter(None, _KINDS))
         raise LogError(
             f"'{path.name}' ends in '{suffix}', which is no known format of logs: "
             f"use one of {', '.join(known)}."

@@ -14,7 +14,6 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.trial.raw_log import Array
 from greybox.trial.readers.ros.axes import (
@@ -171,7 +170,8 @@ def as_topic(table: TableFile) -> TableFile:
         )
     )
     first = next(iter(islice(table.batches(wanted), 1)), {c: np.empty(0) for c in wanted})
-    found.frames = {_path(f): _first_word(first[f]) for f in frames}
+    for f in frames:
+        found.frames[_path(f)] = next((str(w) for w in first[f][:1000] if str(w).strip()), "")
     ahead = None
     made = None if stamp is None else _stamp_column(stamp)
     # headers that nobody stamps hold zero
@@ -239,10 +239,6 @@ def _ahead(batch: Batch, stamp: _Column, recorder: str, table: TableFile) -> flo
     difference = recorded - stamp.make(batch)
     difference = difference[np.isfinite(difference) & (recorded >= EARLIEST_UNIX)]
     return float(np.median(difference)) if len(difference) else None
-
-
-def _first_word(values: NDArray[np.generic]) -> str:
-    return next((str(w) for w in values[:1000] if str(w).strip()), "")
 
 
 def _quaternion(numbers: dict[str, str]) -> tuple[str, ...] | None:

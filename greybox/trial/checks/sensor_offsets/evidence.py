@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from greybox.numerics.lagged_moments import bartlett, weighted_lags
 from greybox.trial.checks.motion import GAINS, outlier_weights, solve, whiten, without_starts
@@ -271,7 +270,11 @@ def expand(tie: KinematicModel, offsets: Array) -> Evidence:
     normal = flat.T @ flat / variance
     pull = flat.T @ y.reshape(-1) / variance
     scores = np.einsum("ncp,nc->np", x, rest) / variance
-    return _embedded(offsets, free, *_robust(normal, pull, scores, tie.motion.step))
+    information, drawn = _robust(normal, pull, scores, tie.motion.step)
+    wide, long = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
+    wide[np.ix_(free, free)] = information
+    long[free] = drawn + information @ offsets[free]
+    return Evidence(offsets, wide, long)
 
 
 def _robust(normal: Array, pull: Array, scores: Array, step: float) -> tuple[Array, Array]:
@@ -295,13 +298,6 @@ def _robust(normal: Array, pull: Array, scores: Array, step: float) -> tuple[Arr
     left = root @ inverse
     information = left @ root.T * np.outer(scale, scale)
     return information, scale * (left @ np.linalg.solve(root, pull / scale))
-
-
-def _embedded(offsets: Array, free: NDArray[np.int64], information: Array, pull: Array) -> Evidence:
-    wide, long = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
-    wide[np.ix_(free, free)] = information
-    long[free] = pull + information @ offsets[free]
-    return Evidence(offsets, wide, long)
 
 
 def coarse_tie(tie: KinematicModel) -> KinematicModel:

@@ -93,7 +93,9 @@ def storage_files(path: Path) -> tuple[list[Path], str, list[str]]:
         ]
         files = sorted(
             found,
-            key=lambda p: [(int(x), "") if x.isdigit() else (-1, x) for x in _digits(p.name)],
+            key=lambda p: [
+                (int(x), "") if x.isdigit() else (-1, x) for x in re.split(r"(\d+)", p.name)
+            ],
         )
         if not information:
             notes.append("metadata.yaml is missing or unreadable: its files were found by name.")
@@ -103,10 +105,6 @@ def storage_files(path: Path) -> tuple[list[Path], str, list[str]]:
             f"name the directory of a ROS 2 bag, the one with metadata.yaml."
         )
     return files, mode, notes
-
-
-def _digits(name: str) -> list[str]:
-    return re.split(r"(\d+)", name)
 
 
 def _metadata(path: Path) -> dict[str, Any]:
