@@ -445,7 +445,7 @@ def _deliver(
     others = (options.sheet, options.report, options.save_model)
     for path in filter(None, (options.out, *_legs_files(options), *others)):
         say(f"wrote {path}")
-    show_next(after_design(provenance(options), bool(headline), design.remedy))
+    show_next(after_design(provenance(options), bool(headline), design.remedy, design.missed()))
 
 
 def _duration(options: argparse.Namespace) -> float:

@@ -368,6 +368,9 @@ def design_for_prediction(
         design = replace(design, efficiency_vs_random=float((errors[0] / errors[1])[0]))
     known = before + log_moments(found, design.motions[1:])
     noise, unknown = found.errors(design.motions[0], known)
+    if vague := [s for i, s in enumerate(states) if noise[0, i] + unknown[0, i] >= 1]:
+        said = f"after this trial the mean would predict {', '.join(vague)} no worse: lengthen it"
+        design = replace(design, notes=(said, *design.notes))
     missed = diagnosed_misfit(model) if level == _DIAGNOSED else {}
     # no cause that a diagnosis knows, and no coefficient, explained it
     unknown = np.maximum(unknown, [missed.get(s, 0.0) ** 2 for s in states])

@@ -477,8 +477,11 @@ def _choose_regimes(
         if begin is None:
             continue
         own = _clear_of_wind(begin.state, base)
-        held = start is not None and _agrees(start, signs, states)
-        if held and (asked.trials > 1 or _depth(start, signs, margins, states) >= 0):
+        if (
+            start is not None
+            and _agrees(start, signs, states)
+            and (asked.trials > 1 or _depth(start, signs, margins, states) >= 0)
+        ):
             # else a lead-in brings her to where the regime can be judged
             own = start
         if _depth(own, signs, margins, states) < -1e-6 and own is not start:

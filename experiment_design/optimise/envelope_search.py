@@ -252,6 +252,25 @@ def exchange_settings(
                 )  # fmt: skip
         return out
 
+    def strayed(levels: Array, candidate: Candidate) -> NDArray[np.bool_]:
+        """Return in which holds (K,) a sequence breaks limits on its path."""
+        if (candidate.missed[:-1] <= TOLERANCE).all():
+            return np.zeros(holds, bool)
+        commands = problem.schedule.expand(problem.schedule.within_reach(levels))
+        state = problem.scenarios[0].rollout.run(commands[None]).state[0, 1:]
+        over = np.any(problem.scenarios[0].limits.path_values(state) > TOLERANCE, axis=0)
+        firsts = np.arange(0, len(state), problem.schedule.hold)
+        return np.logical_or.reduceat(over, firsts)[:holds]
+
+    def mended(levels: Array, astray: NDArray[np.bool_], rng: np.random.Generator) -> Array:
+        """Return a sequence with other settings where it breaks limits, and shortly before."""
+        out = levels.copy()
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], astray.astype(int), [0]])))
+        for first, last in zip(edges[::2], edges[1::2], strict=True):
+            setting, held = picked(rng)
+            out[max(begun, first - held) : last] = setting
+        return out
+
     scale = np.append(limit_scale(problem), UNIT_SCALE[""])
 
     def better(found: list[tuple[Array, Candidate]]) -> list[tuple[Array, Candidate]]:
@@ -269,7 +288,11 @@ def exchange_settings(
             pool = judged(anew)
         for _ in range(rounds):
             parents = rng.integers(len(pool), size=tries)
-            children = np.array([moved(pool[i][0], rng) for i in parents])
+            astray = [strayed(levels, candidate) for levels, candidate in pool]
+            children = np.array([
+                mended(pool[i][0], astray[i], rng) if astray[i].any() else moved(pool[i][0], rng)
+                for i in parents
+            ])  # fmt: skip
             pool = better(pool + judged(children))
         return pool[0]
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from greybox.report.next_steps import NextStep, typed
 
 
-def after_design(record: Mapping[str, Any], judged: bool, remedy: str = "") -> list[NextStep]:
+def after_design(
+    record: Mapping[str, Any], judged: bool, remedy: str = "", missed: Sequence[str] = ()
+) -> list[NextStep]:
     """Return what to do once the plan has been sailed, or before one that breaks its limits is.
 
     Parameters
@@ -19,9 +21,12 @@ def after_design(record: Mapping[str, Any], judged: bool, remedy: str = "") -> l
         Whether the plan has a part to judge the estimate by.
     remedy : str
         What helps a plan that does not keep its limits as it was asked to.
+    missed : sequence of str
+        Which limits it does not keep.
     """
     if remedy:
-        return [NextStep(f"Do not sail this plan as it is: {remedy}")]
+        why = f" ({'; '.join(missed)})" if missed else ""
+        return [NextStep(f"Do not sail this plan as it is{why}: {remedy}")]
     vessel, given = typed(record, "vessel", "V"), record.get("command", {})
     check = NextStep(
         "Sail the plan, and check its log before you leave the area",

@@ -287,10 +287,10 @@ class Design(DisplayMixin):
         return f" behind a lead-in of {self.lead_in_s:g} s" if self.lead_in_s else ""
 
     def missed(self) -> list[str]:
-        """Return the limits that are not kept, each with its bound and by how much."""
+        """Return which limits are not kept, each with its bound and by how much."""
         bounds = [f"{x.name} of {x.bound:g} {x.unit}".rstrip() for x in self.broken]
         return [
-            f"{told}: missed by {x.missed:.3g} {x.unit}".rstrip()
+            f"the {told} is missed by {x.missed:.3g} {x.unit}".rstrip()
             for told, x in zip(bounds, self.broken, strict=True)
         ]
 

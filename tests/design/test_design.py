@@ -459,7 +459,7 @@ def test_the_closest_plan_to_margins_out_of_reach(monkeypatch):
     assert design.keeping.probability == 0.0
     assert request.stand_ins in str(told.value)
     assert request.stand_ins in design.remedy
-    assert "margin of surge of 9 m/s: missed by" in design.summary()
+    assert "the margin of surge of 9 m/s is missed by" in design.summary()
 
 
 def test_a_margin_out_of_reach_of_a_ship_that_crosses_zero_in_sway():

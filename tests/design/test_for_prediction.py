@@ -263,6 +263,7 @@ def test_a_plan_leaves_less_than_random_sequences(found) -> None:
     assert told["random_kept"] > 0
     assert told["efficiency_of"].startswith("mean squared error of predictions")
     assert f"leaves {gain:.2f} times the mean squared error" in found.summary()
+    assert "the mean would predict" not in found.summary()
     assert "poor" in found.headline()
     # commands stay in the envelope, the motion keeps way on
     commands = found.design.commands[0]
@@ -436,6 +437,20 @@ def test_options_that_do_not_go_together(files, options, message, capsys) -> Non
     assert not (files / "none.csv").exists()
 
 
+def test_settings_are_exchanged_where_a_sequence_breaks_a_limit(envelope) -> None:
+    """No random sequence keeps this margin for so long, and one that is mended does."""
+    start = envelope.rollout.start
+    request = request_of(duration=400.0, limits=TrialLimits(margins={"u": 1.8}), starts=(start,))
+    problem = build_problem(request)
+    search = exchange_settings(
+        problem, envelope, lambda motion: np.zeros(len(motion.state)), 0, effort=0.15, tries=16,
+        workers=1,
+    )  # fmt: skip
+    assert search.kept == 0
+    assert search.reference.missed.max() > 0.1
+    assert search.candidate.missed.max() == 0.0
+
+
 def test_a_trial_starts_on_the_fastest_course_that_its_cap_allows(envelope) -> None:
     fast = started_in(request_of(), envelope, 0).starts[0]
     np.testing.assert_allclose(fast, envelope.rollout.start)
@@ -461,14 +476,16 @@ def test_the_closest_plan_where_no_other_is_found(model) -> None:
 def test_the_closest_plan_to_a_margin_out_of_reach(model) -> None:
     """It says which margin it keeps, and is held against the one that was asked for."""
     told = OutOfReach(TrialLimits(margins={"u": 9.0}), None, "no motion keeps 9 m/s.")
-    # no plan goes to both sides at this speed
+    # so long a plan does not go to both sides at this speed
     limits = TrialLimits(margins={"u": 2.1})
-    request = request_of(duration=60.0, effort=0.01, limits=limits, out_of_reach=told)
+    request = request_of(duration=300.0, effort=0.01, limits=limits, out_of_reach=told)
     design = design_for_prediction(request, model, best_effort=True).design
     assert design.status == CLOSEST
     assert "no motion keeps 9 m/s." in design.notes
     kept = design.margins["u"]
     assert kept < 2.1
+    # it hardly moves the ship
+    assert any(n.startswith("after this trial the mean would predict") for n in design.notes)
     assert design.request.stand_ins == f"--margin-u {np.floor(1e3 * kept) / 1e3:g}"
     (report,) = design.broken
     assert report.missed == pytest.approx(9.0 - kept)
