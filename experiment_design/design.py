@@ -22,6 +22,7 @@ from experiment_design.feasibility.checks import (
     require_informative,
     require_stable,
     require_start,
+    tells_enough,
     unexcited,
 )
 from experiment_design.feasibility.constraint_satisfaction import (
@@ -113,7 +114,7 @@ def design_trial(
     """
     began = time.perf_counter()
     require_horizon(request)
-    request = after_lead_in(request, best_effort=best_effort)
+    request = after_lead_in(request, tells_enough, best_effort=best_effort)
     problems = [build_problem(request, t) for t in range(request.trials)]
     _log.info(
         "%d trial(s) of %g s, %d levels each, criterion %s", len(problems), request.duration,

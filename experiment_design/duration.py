@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from experiment_design.feasibility.checks import tells_enough
 from experiment_design.feasibility.constraint_satisfaction import tightened_campaign
 from experiment_design.optimise.campaign import (
     Progress,
@@ -64,7 +65,7 @@ def least_duration(
     for name, value in targets.items():
         if not 0 < value < np.inf:
             raise UsageError(f"the target of {name} is {value:g}, it must be positive.")
-    request = after_lead_in(request, best_effort=best_effort)
+    request = after_lead_in(request, tells_enough, best_effort=best_effort)
     predictor = request.build_predictor()
     # of two names of one column the one with the smaller target
     told: dict[int, str] = {}

@@ -15,7 +15,7 @@ from experiment_design.certificate.certificate import absent
 from experiment_design.constraints.limits import TOLERANCE, Circumstances, Limit
 from experiment_design.design import CLOSEST, described
 from experiment_design.excitation.rollout import Motion
-from experiment_design.feasibility.checks import missed_at_start, require_horizon, smallest_circle
+from experiment_design.feasibility.checks import require_horizon, smallest_circle
 from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
     tighten,
@@ -406,7 +406,7 @@ def started_in(request: PreparedRequest, envelope: Envelope, kept: int) -> Prepa
         return request
     problem = build_problem(request, request.trials - 1)
     for start, commands in _courses(envelope):
-        if (missed_at_start(problem, start) > TOLERANCE).any():
+        if (problem.missed_at_start(start) > TOLERANCE).any():
             continue
         given = request.start_commands or (None,) * request.trials
         return replace(

@@ -136,18 +136,10 @@ def missed_targets(
     ]
 
 
-def missed_at_start(problem: TrialProblem, begun: Array) -> Array:
-    """Return by how much states and heading (nx + 1,) miss each path limit, negative where kept."""
-    program = problem.scenarios[0].limits
-    start = np.zeros(program.nx + 3)
-    start[: program.nx + 1] = begun
-    return np.asarray(program.path_values(start[None])[:, 0])
-
-
 def require_start(problem: TrialProblem, request: PreparedRequest, trial: int) -> None:
     """Raise where the start itself breaks a limit."""
     program = problem.scenarios[0].limits
-    missed = missed_at_start(problem, request.starts[trial])
+    missed = problem.missed_at_start(request.starts[trial])
     for limit, m, more in zip(program.path_limits, missed, program.backoff, strict=True):
         if m - more > TOLERANCE:
             raise InfeasibleError(limit.start_advice(float(m)))

@@ -6,7 +6,7 @@ descend along the exact gradient of what the limits are missed by (single shooti
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +18,6 @@ from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import TOLERANCE, Limit, PathLimit
 from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.excitation.schedule import Schedule
-from experiment_design.feasibility.checks import missed_at_start, tells_enough
 from experiment_design.request.regimes import state_words
 from experiment_design.request.request import (
     LeadIn,
@@ -30,6 +29,7 @@ from experiment_design.request.request import (
 from greybox.errors import InfeasibleError
 
 Array = NDArray[np.float64]
+Enough = Callable[[PreparedRequest], bool]
 
 # longest lead-in [s]: a ship of 30 m has forgotten her start by then, and one of 300 m has begun
 # to move; a crew that needs longer steadies her better by hand. In a refusal it is told as time
@@ -52,18 +52,20 @@ _RELAXED, _SHARES = (1.1, 1.5, 2.0, 3.0, 5.0), (0.95, 0.9, 0.8, 0.65, 0.4, 0.2)
 def short_of_margin(request: PreparedRequest) -> bool:
     """Whether the first trial's start misses margins and nothing else."""
     problem = build_problem(replace(request, backoff=()))
-    missed = missed_at_start(problem, request.starts[0]) > TOLERANCE
+    missed = problem.missed_at_start(request.starts[0]) > TOLERANCE
     margins = problem.scenarios[0].limits.of_regime
     return bool((missed & margins).any() and not (missed & ~margins).any())
 
 
-def find_lead_in(request: PreparedRequest) -> LeadIn | None:
+def find_lead_in(request: PreparedRequest, enough: Enough | None = None) -> LeadIn | None:
     """Return the shortest lead-in into the regime, None where the start keeps its margins.
 
     Parameters
     ----------
     request : PreparedRequest
         Several trials begin as they are asked to.
+    enough : callable, optional
+        Whether a trial behind lower margins, which a refusal names, tells enough.
 
     Raises
     ------
@@ -85,20 +87,24 @@ def find_lead_in(request: PreparedRequest) -> LeadIn | None:
         found = _Shooting(request, holds).search()
         if found is not None:
             return found
-    raise _refusal(request, most)
+    raise _refusal(request, most, enough)
 
 
-def after_lead_in(request: PreparedRequest, *, best_effort: bool = False) -> PreparedRequest:
+def after_lead_in(
+    request: PreparedRequest, enough: Enough | None = None, *, best_effort: bool = False
+) -> PreparedRequest:
     """Return the request of the trial behind the lead-in that `find_lead_in` finds, if any.
 
     Parameters
     ----------
     request : PreparedRequest
+    enough : callable, optional
+        See `find_lead_in`.
     best_effort : bool
         Margins that one leads to take the place of those out of reach.
     """
     try:
-        found = find_lead_in(request)
+        found = find_lead_in(request, enough)
     except OutOfReachError as error:
         if not best_effort:
             raise
@@ -236,7 +242,7 @@ class _Shooting:
         return -self.schedule.sample_time / np.log(slowest) if 0 < slowest < 1 else np.inf
 
 
-def _refusal(request: PreparedRequest, holds: int) -> InfeasibleError:
+def _refusal(request: PreparedRequest, holds: int, enough: Enough | None) -> InfeasibleError:
     """Return the error on which limit stops a lead-in, and the least change found to help."""
     shooting = _Shooting(request, holds)
     missed = shooting.nearest()
@@ -270,7 +276,7 @@ def _refusal(request: PreparedRequest, holds: int) -> InfeasibleError:
         lower = float(np.floor(1e3 * share * reached) / 1e3)
         eased = replace(request, limits=limit.with_bound(request.limits, lower))
         found = _Shooting(eased, holds).search()
-        if found is not None and tells_enough(found.after(eased)):
+        if found is not None and (enough is None or enough(found.after(eased))):
             said += f". Use {limit.option} {lower:g}, or a --start nearer to the regime."
             return OutOfReachError(OutOfReach(request.limits, eased.limits, said))
     return InfeasibleError(f"{said}. Choose another --regime, or a --start nearer to it.")

@@ -104,6 +104,13 @@ class TrialProblem:
         """Return the commands at each sample, (..., N, nc), of unit coordinates (..., K, nc)."""
         return self.schedule.expand(self.levels(unit))
 
+    def missed_at_start(self, begun: Array) -> Array:
+        """Return what states and heading (nx + 1,) miss each path limit by, negative if kept."""
+        program = self.scenarios[0].limits
+        start = np.zeros(program.nx + 3)
+        start[: program.nx + 1] = begun
+        return np.asarray(program.path_values(start[None])[:, 0])
+
     def moments(self, motion: Motion, scenario: int) -> Moments:
         """Return the sums of a scenario's motion, the known ones included."""
         return moments_of(self.scenarios[scenario].information, motion, self._known_to(scenario))

@@ -11,6 +11,7 @@ from designs import limited_ship, make_request
 from experiment_design.constraints.limits import Circle, TrialLimits
 from experiment_design.design import design_trial
 from experiment_design.excitation.rollout import Rollout
+from experiment_design.feasibility.checks import tells_enough
 from experiment_design.optimise.campaign import own_moments
 from experiment_design.optimise.lead_in import (
     LONGEST,
@@ -134,12 +135,12 @@ def test_the_descent_has_the_exact_gradient() -> None:
 def test_a_refusal_names_the_limit_and_what_helps(limits, told) -> None:
     request = at_rest(limits=limits)
     with pytest.raises(InfeasibleError, match="no lead-in of at most 120 s") as caught:
-        find_lead_in(request)
+        find_lead_in(request, tells_enough)
     assert told in str(caught.value)
     if "margins" not in limits:
         return
     # the closest plan begins behind a lead-in to margins that leave its trial room
-    closest = after_lead_in(request, best_effort=True)
+    closest = after_lead_in(request, tells_enough, best_effort=True)
     assert closest.lead_in is not None
     assert closest.stand_ins in str(caught.value)
     assert closest.as_asked().limits.margins == limits["margins"]
