@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.causes.hull import is_coupling, term_parameters
+from greybox.diagnosis.causes.sensors import abeam
 from greybox.diagnosis.evidence.kinematics import denied
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
@@ -228,23 +229,52 @@ def _with_sensors(
     """Return a fit and its causes, with the defects of sensors that the kinematics leave open.
 
     The choice of terms knows no sensors, and its terms imitate them: an asymmetry of thrust turns
-    surge into sway as a compass bias does, coupled inertia the yaw rate as an antenna away from
-    the origin. One defect alone is then hardly seen. All together are in force where the fit is
-    likelier with them, each number at its price, and follows the held-out logs more nearly;
-    each is weighed at the end, as the terms are.
+    surge into sway as a compass bias does. One defect alone is then hardly seen beside another.
+    All, or else one, are in force where the fit is likelier with them, each number at its price,
+    and follows the held-out logs more nearly; each is weighed at the end, as the terms are. An
+    antenna ahead of the origin moves as a ship with other coupled inertia does, so forces tell
+    only one of the two: it stands in the place of that, or is abeam only.
     """
     defects = [h for h in hypotheses if h.cause in _TURNED and h not in named]
     if not defects or not any(h.cause in _LIKE_TURNED for h in named):
         return fit, named
+    uncoupled = [h for h in named if h.cause != "inertia_coupling"]
+    alike = len(uncoupled) < len(named) and any(h.cause == "lever_arm" for h in defects)
+    beside = [abeam(h) if alike and h.cause == "lever_arm" else h for h in defects]
+    every = [[*named, *beside], *([[*uncoupled, *defects]] if alike else [])]
+    alone = [[*named, h] for h in beside if len(beside) > 1]
+    return _best_of(case, fit, named, every) or _best_of(case, fit, named, alone) or (fit, named)
+
+
+def _best_of(
+    case: DiagnosisProblem,
+    fit: Fit,
+    named: Sequence[Hypothesis],
+    ways: Sequence[list[Hypothesis]],
+) -> tuple[Fit, list[Hypothesis]] | None:
+    """Return the likeliest fit with other causes than those named, and these; None if none is."""
     problem = case.problem(fit.integrator)
-    point = fit.point
-    for hypothesis in defects:
-        point = problem.add(point, hypothesis)
-    other = problem.settle(problem.fit(point, fit.noise), SETTLE)
-    price = np.log(problem.counts.sum()) * (len(point.vector()) - len(fit.point.vector()))
-    if other.escaped or other.cost + price > fit.cost or not _nearer(case, other, fit):
-        return fit, named
-    return other, [*named, *defects]
+    points = []
+    for causes in ways:
+        point = fit.point
+        for hypothesis in named:
+            point = point if hypothesis in causes else problem.drop(point, hypothesis)
+        for hypothesis in causes:
+            point = point if hypothesis in named else problem.add(point, hypothesis)
+        points.append(point)
+
+    def work(k: int) -> tuple[Fit, bool]:
+        found = problem.settle(problem.fit(points[k], fit.noise), SETTLE)
+        return found, not found.escaped and _nearer(case, found, fit)
+
+    price = np.log(problem.counts.sum())
+    best: tuple[Fit, list[Hypothesis]] | None = None
+    for (found, nearer), causes in zip(on_all_processors(points, work), ways, strict=True):
+        least = fit if best is None else best[0]
+        dearer = price * (len(found.point.vector()) - len(least.point.vector()))
+        if nearer and found.cost + dearer < least.cost:
+            best = found, causes
+    return best
 
 
 def _nearer(case: DiagnosisProblem, fit: Fit, other: Fit) -> bool:

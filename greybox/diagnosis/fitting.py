@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from greybox.diagnosis.normal import bounded_step, inverse
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import CURRENTS, LogRun, Ship
 from greybox.diagnosis.thresholds import DECIDED
+from greybox.model.run.step import MONOTONE
 from greybox.numerics.lagged_moments import automatic_lags, bartlett_sums
 
 Array = NDArray[np.float64]
@@ -159,10 +161,27 @@ class Problem:
         first = len(point.places) + sum(map(len, point.values[:k]))
         return list(range(first, first + len(point.values[k])))
 
+    @cached_property
+    def _least(self) -> Array:
+        """Least coefficients (p,): more damping would look like less, as steps alternate."""
+        limit = MONOTONE[self.runs[0].integrator]
+        found = np.full(len(self.structure.terms), -np.inf)
+        motion = np.concatenate([run.y for run in self.runs])
+        for i, term in enumerate(self.structure.terms):
+            if term.dissipates and {f.signal for f in term.factors} <= set(self.structure.states):
+                # of what acts as linear damping that takes as much energy out
+                y = dict(zip(self.runs[0].outputs, np.abs(motion).T, strict=True))
+                force = np.prod([y[f.signal] for f in term.factors if not f.bump], axis=0)
+                taken = float((force * y[term.state]).sum())
+                found[i] = limit * float((y[term.state] ** 2).sum()) / taken if taken else -np.inf
+        return found
+
     def bounds(self, point: Point) -> tuple[Array, Array]:
         """Return least and largest values of the free numbers of a point."""
         size = len(point.vector())
         low, high = np.full(size, -np.inf), np.full(size, np.inf)
+        full = np.concatenate([self._least, np.full(len(CURRENTS), -np.inf)])
+        low[: len(point.places)] = full[list(point.places)]
         if self.metric == "free run":
             # chosen damping takes energy out, as its choice had it
             terms = self.structure.terms

@@ -350,10 +350,14 @@ def _beside_others(candidates: Sequence[Candidate]) -> list[Candidate]:
     """Return candidates whose proof, where they hold a run within bounds, is that few others do.
 
     What no sum tells is told by rank: the p-value is the share of the other causes that hold the
-    run as well.
+    run as well. Delay, lag and rate limit count as one: each does much of what another one does.
     """
-    every = {c.hypothesis.cause for c in candidates}
-    holding = {c.hypothesis.cause for c in candidates if c.proof.gain == np.inf}
+
+    def kind(candidate: Candidate) -> str:
+        return "late" if candidate.hypothesis.past else candidate.hypothesis.cause
+
+    every = {kind(c) for c in candidates}
+    holding = {kind(c) for c in candidates if c.proof.gain == np.inf}
     share = (len(holding) - 1) / max(len(every) - 1, 1)
     return [
         replace(c, proof=replace(c.proof, p_value=share)) if c.proof.gain == np.inf else c
@@ -518,7 +522,7 @@ def weighed(case: DiagnosisProblem, found: Search) -> Search:
             stood += _stood(case, fit, waiting, found)
             waiting = []
             continue
-        least, without = min(fallen, key=lambda item: _beyond(item[0]))
+        least, without = min(fallen, key=lambda item: _worth(item[0]))
         leaning.append(least)
         stood = [item for item in stood if item[0] is not least]
         if _needed(case, found.final, without):
@@ -591,8 +595,9 @@ def _stands(cause: Candidate) -> bool:
     return cause.standing is not None and cause.standing.stands and cause.counts
 
 
-def _beyond(cause: Candidate) -> float:
-    return -np.inf if cause.standing is None else cause.standing.beyond.gain
+def _worth(cause: Candidate) -> float:
+    """Return what a cause does for held-out logs; with a generic force it is told less surely."""
+    return -np.inf if cause.standing is None else cause.proof.gain
 
 
 def _without(problem: Problem, fit: Fit, cause: Candidate) -> Fit:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import factorial
 
 import numpy as np
 import pytest
 
+from greybox.diagnosis.causes.sensors import LeverArm, abeam
 from greybox.diagnosis.chosen import _with_sensors
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import prepare
+from greybox.model.run.step import MONOTONE, Integrator
 from greybox.study.blind import draw
 from greybox.trial.log import TrialLog
 
@@ -48,3 +51,43 @@ def test_defects_of_sensors_stand_beside_terms_that_imitate_them(defect: bool) -
     told = {h.cause: v for h, v in zip(found.point.hypotheses, found.point.values, strict=True)}
     assert np.abs(told["heading_bias"]) == pytest.approx([BIAS], abs=0.01)
     assert told["lever_arm"] == pytest.approx(ARM, abs=0.25)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+def test_damping_stays_where_a_step_decays_more_the_more_it_is(integrator: Integrator) -> None:
+    z = np.linspace(MONOTONE[integrator], 0.0, 200)
+    powers = range(2 if integrator == "euler" else 5)
+    step = sum(z**k / factorial(k) for k in powers)
+    assert np.all(np.diff(step) > 0)
+    assert step[0] >= 0
+    trial = draw(np.random.default_rng([4, 2]), (), samples=500, positions=False)
+    ready = prepare([trial.estimation], [trial.validation], None, "linear+N_|r|r", ["lever_arm"])
+    problem = ready.case.problem(integrator)
+    base = ready.base()
+    names = problem.structure.parameters
+    theta = base.point.base.theta.copy()
+    # the pole of a rate of 0.3 again, on the other side, and all forces as much larger
+    theta[names.index("Nr")] = -1.7 if integrator == "euler" else -2.6
+    twin = replace(base.point, base=replace(base.point.base, theta=theta))
+    found = problem.settle(problem.fit(twin, base.noise))
+    told = dict(zip(names, found.point.base.theta, strict=True))
+    assert MONOTONE[integrator] <= told["Nr"] < 0
+    r = trial.estimation["r"]
+    least = dict(zip(names, problem.bounds(base.point)[0], strict=False))
+    expected = MONOTONE[integrator] * (r**2).sum() / (np.abs(r) ** 3).sum()
+    assert least["N_|r|r"] == pytest.approx(expected)
+
+
+def test_only_the_place_abeam_of_an_antenna_is_sought_beside_coupled_inertia() -> None:
+    trial = draw(np.random.default_rng([4, 2]), (), samples=200, positions=False)
+    ready = prepare([trial.estimation], [trial.validation], None, "thesis", ["lever_arm"])
+    (arm,) = ready.hypotheses
+    ship = ready.base().point.ship
+    length = trial.estimation.vessel.length
+    assert [p.high for p in arm.parameters] == [length, length / 2]
+    other = abeam(arm)
+    assert [p.name for p in other.parameters] == ["lever_arm_y"]
+    assert other.apply is not None
+    assert other.apply(ship, np.array([0.3])).sensors.lever == (0, 0.3)
+    said = LeverArm().evidence({"lever_arm_y": (-2.0, 0.1)})
+    assert said == "the velocities are those of a point 2.00 ± 0.10 m to port of the origin"

@@ -39,9 +39,11 @@ def test_coefficients_and_currents_of_a_cause_have_its_bounds(ready) -> None:
     where = problem.numbers_of(point, hypothesis)[: len(hypothesis.parameters)]
     np.testing.assert_array_equal(low[where], [p.low for p in hypothesis.parameters])
     np.testing.assert_array_equal(high[where], [p.high for p in hypothesis.parameters])
-    # all else is free
+    # all else is free, but that no damping exceeds what a step can take
     others = np.setdiff1d(np.arange(len(low)), where)
-    assert np.isinf(low[others]).all()
+    terms = problem.structure.terms
+    damping = [k for k, i in enumerate(point.places) if i < len(terms) and terms[i].dissipates]
+    assert np.isinf(low[np.setdiff1d(others, damping)]).all()
     assert np.isinf(high[others]).all()
 
 
@@ -178,3 +180,13 @@ def test_a_run_that_many_causes_hold_within_bounds_is_no_proof_of_one() -> None:
     assert [c.proof.p_value for c in _beside_others(many)] == [2 / 3, 2 / 3, 2 / 3, 1.0]
     alone = [held("a", np.inf), held("b", -np.inf)]
     assert _beside_others(alone)[0].proof.p_value == 0.0
+
+
+def test_delay_and_lag_that_hold_a_run_within_bounds_are_one_kind_of_cause() -> None:
+    def held(cause: str, gain: float, past: bool) -> Candidate:
+        hypothesis = Hypothesis(cause, cause, (), (), past=past)
+        return Candidate(hypothesis, None, 1.0, 0.0, 0.0, proof_of(np.full(3, gain)))
+
+    late = [held("input_delay", np.inf, True), held("thruster_lag", np.inf, True)]
+    found = _beside_others([*late, held("clock_offset", -np.inf, False)])
+    assert [c.proof.p_value for c in found] == [0.0, 0.0, 1.0]

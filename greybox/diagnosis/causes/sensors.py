@@ -69,24 +69,39 @@ class LeverArm(Cause):
         """Return both coordinates together."""
         if not _has_velocities(context):
             return ()
-        most = 2 * context.vessel.length
+        length = context.vessel.length
 
         def apply(ship: Ship, value: Array) -> Ship:
             lever = (float(value[0]), float(value[1]))
             return replace(ship, sensors=replace(ship.sensors, lever=lever))
 
-        names = ("lever_arm_x", "lever_arm_y")
-        parameters = tuple(Parameter(n, "m", 0.0, -most, most, step=1e-3) for n in names)
+        # on the hull, wherever the origin lies on it
+        reach = {"lever_arm_x": length, "lever_arm_y": 0.5 * length}
+        parameters = tuple(Parameter(n, "m", 0.0, -m, m, step=1e-3) for n, m in reach.items())
         return (Hypothesis(self.id, self.id, parameters, (), apply),)
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say where the antenna is."""
-        (x, dx), (y, dy) = values["lever_arm_x"], values["lever_arm_y"]
-        return (
-            f"the velocities are those of a point {with_error(abs(x), dx)} m "
-            f"{'ahead' if x > 0 else 'abaft'} and {with_error(abs(y), dy)} m to "
-            f"{'starboard' if y > 0 else 'port'} of the origin"
-        )
+        sides = {"lever_arm_x": ("ahead", "abaft"), "lever_arm_y": ("to starboard", "to port")}
+        told = [
+            f"{with_error(abs(value), std)} m {sides[name][value < 0]}"
+            for name, (value, std) in values.items()
+        ]
+        return f"the velocities are those of a point {' and '.join(told)} of the origin"
+
+
+def abeam(arm: Hypothesis) -> Hypothesis:
+    """Return a lever arm of which only the place abeam is free.
+
+    An antenna ahead of the origin moves as a ship with other coupled inertia does: beside that,
+    forces tell no more of it.
+    """
+
+    def apply(ship: Ship, value: Array) -> Ship:
+        lever = (ship.sensors.lever[0], float(value[0]))
+        return replace(ship, sensors=replace(ship.sensors, lever=lever))
+
+    return replace(arm, parameters=arm.parameters[1:], apply=apply)
 
 
 class ClockOffset(Cause):

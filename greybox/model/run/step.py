@@ -24,6 +24,9 @@ from greybox.rotation import body_to_ned
 
 Array = NDArray[np.float64]
 Integrator = Literal["euler", "rk4"]
+# rate of decay times the sample time, below zero, beyond which a step decays less, or alternates:
+# the two sides of it are twins that a log of samples hardly tells apart
+MONOTONE: dict[Integrator, float] = {"euler": -1.0, "rk4": -1.596}
 Heading = Literal["measured", "simulated"]
 Rule = Literal["euler", "trapezoid"]
 
