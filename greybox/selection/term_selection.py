@@ -246,6 +246,7 @@ def select_terms(
         for n in {len(s.terms) for s in sets}
         if _error(sets, n) <= _LOST * min(_error(others, n) for others in whole)
     ]
+    alternatives = _moving(selection, whole, alternatives, spread)
     scores: list[list[float]] = [[] for _ in alternatives]
     for path, (_, held) in zip(paths, _judging_parts(logs), strict=True):
         judged = FreeRunSelection(held, family, kind)
@@ -428,6 +429,31 @@ def _of_size(sets: Sequence[Selected], size: int) -> Selected | None:
     """Return the set of best fit with at most so many terms, None where there is none."""
     small = [s for s in sets if len(s.terms) <= size]
     return min(small, key=lambda s: s.cost, default=None)
+
+
+def _moving(
+    selection: FreeRunSelection,
+    whole: Sequence[Sequence[Selected]],
+    alternatives: Sequence[tuple[int, int]],
+    spread: Array,
+) -> list[tuple[int, int]]:
+    """Return those (beginning, size) that move in every channel in which another one does.
+
+    One that follows its own logs no better than a constant does somewhere, where another set
+    follows them, may still have the best mean over the channels of short parts.
+    """
+    moves = spread > 0
+    found = [_of_size(whole[begun], size) for begun, size in alternatives]
+    ratio = np.array(
+        [
+            np.mean(np.concatenate(selection.errors(s.p))[:, moves] ** 2, axis=0)
+            if s
+            else np.full(moves.sum(), np.inf)
+            for s in found
+        ]
+    ) / spread[moves] ** 2  # fmt: skip
+    rests = (ratio >= 1) & (ratio > _LOST * ratio.min(axis=0))
+    return [a for a, still in zip(alternatives, rests.any(axis=1), strict=True) if not still]
 
 
 def _error(sets: Sequence[Selected], size: int) -> float:

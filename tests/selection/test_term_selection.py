@@ -19,8 +19,8 @@ from greybox.selection import term_selection
 from greybox.selection.cross_validation import Refit, parts_of
 from greybox.selection.estimate import _leaves_more, at_own_pace, estimate_model, nominal_model
 from greybox.selection.family import family_for, first_terms, spell_structure
-from greybox.selection.free_run_selection import FreeRunSelection
-from greybox.selection.term_selection import select_terms
+from greybox.selection.free_run_selection import FreeRunSelection, Selected
+from greybox.selection.term_selection import _moving, select_terms
 from greybox.trial.log import make_log
 from greybox.validation.fit import average_fit, run_model
 from greybox.vessel.force import force_inputs
@@ -289,3 +289,24 @@ def test_the_default_predicts_a_foreign_ship_better_than_a_published_structure(c
     assert fit(model) > fit(published)
     assert "terms were selected" in " ".join(chosen.notes)
     assert presets()["survey-catamaran-2m"].ship.length == model.vessel.length
+
+
+def test_a_set_that_rests_in_a_channel_that_others_follow_is_not_chosen() -> None:
+    class Runs:
+        def errors(self, p: np.ndarray) -> list[np.ndarray]:
+            return [np.tile(p, (50, 1))]
+
+    def sets(*errors: tuple[float, float]) -> list[Selected]:
+        return [
+            Selected(tuple("abcdef"[: k + 1]), np.array(e), 1 / (k + 1))
+            for k, e in enumerate(errors)
+        ]
+
+    # in deviations of 2 and 0.1: the first set moves in one channel only, the second in both
+    spread = np.array([2.0, 0.1])
+    whole = [sets((0.4, 0.1), (0.5, 0.02)), sets((0.6, 0.11))]
+    every = [(0, 1), (0, 2), (1, 1)]
+    assert _moving(Runs(), whole, every, spread) == [(0, 2)]
+    # what none of them follows, or hardly, excludes none
+    whole = [sets((0.4, 0.1), (0.5, 0.09)), sets((0.6, 0.11))]
+    assert _moving(Runs(), whole, every, spread) == every
