@@ -50,3 +50,6 @@ ANGLES = frozenset({"psi", "gamma_q", "cog", "dir_q", "dir_t", "dir_w"})
 LOGGED = ("t", "x_n", "y_n", "psi", "u", "v", "r", "u_q", "v_q")
 # what a model predicts: a run needs none of them past its start
 MOTIONS = frozenset({"x_n", "y_n", "psi", "u", "v", "r"})
+
+# how sentences, axes and tables name motions (SNAME, 1950)
+MOTIONS = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}

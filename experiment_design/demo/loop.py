@@ -14,6 +14,7 @@ from experiment_design.design import design_trial
 from experiment_design.output.result import Design, write_plan
 from experiment_design.prepare import prepare_request
 from experiment_design.request.request import DesignRequest
+from greybox.channels import MOTIONS
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.gain import gains
 from greybox.diagnosis.result import Diagnosis, Found
@@ -55,7 +56,6 @@ _SECONDS, _NEXT_SECONDS = 600.0, 600.0
 _REGIME, _MARGIN_U, _MARGIN_V = "u+v+", 0.5, 0.4
 # share of the usual search: enough to beat random sequences clearly
 _EFFORT = 0.3
-_NAMES = {"u": "surge", "v": "sway", "r": "yaw rate"}
 
 
 def run_demo(
@@ -239,7 +239,7 @@ def _estimated(estimate: Estimate) -> Step:
 
 def _fits(comparison: Comparison, row: int) -> str:
     return ", ".join(
-        f"{_NAMES[s]} {v:.1f} %" if v > -1000 else f"{_NAMES[s]} diverged"
+        f"{MOTIONS[s]} {v:.1f} %" if v > -1000 else f"{MOTIONS[s]} diverged"
         for s, v in comparison.fits()[row].items()
     )
 
@@ -285,10 +285,10 @@ def _diagnosed(diagnosis: Diagnosis, hidden: Sequence[Effect]) -> Step:
 def _gained(compared: Comparison, sample_time: float, seed: int) -> Step:
     before, after = compared.runs
     told = [
-        f"{_NAMES[s]} from {g.before:.1f} to {g.after:.1f} % (95 % interval of the gain "
+        f"{MOTIONS[s]} from {g.before:.1f} to {g.after:.1f} % (95 % interval of the gain "
         f"{g.ci[0]:.1f} to {g.ci[1]:.1f})"
         for s, g in gains(before, after, sample_time, seed).items()
-        if s in _NAMES
+        if s in MOTIONS
     ]
     return Step(
         "Measure the gain",

@@ -13,15 +13,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from greybox.channels import MOTIONS
 from greybox.estimation.verdict import Divergence, Reason
 from greybox.notebook import DisplayMixin, number, table
-
-_WORDS = {"u": "surge", "v": "sway", "r": "yaw rate"}
 
 
 def channel_words(channel: str) -> str:
     """Return what a state is called, its symbol where it has no name."""
-    return _WORDS.get(channel, channel)
+    return MOTIONS.get(channel, channel)
 
 
 class PredictionLevel(StrEnum):

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from greybox.channels import MOTIONS
 from greybox.model.model import ManoeuvringModel
 from greybox.trial.log import TrialLog
 
-_NAMES = {"u": "surge", "v": "sway", "r": "yaw rate"}
 # shares of a range's width, and of its values, by which one may be outside it
 _SLACK, _NEAR = 0.05, 0.01
 
@@ -46,7 +46,7 @@ class Extrapolation:
         if most > least:
             spread = f"goes from {least * factor:z.3g} to {most * factor:z.3g}{unit}"
         return (
-            f"extrapolated: {_NAMES.get(self.signal, self.signal)} {spread}, and the model was "
+            f"extrapolated: {MOTIONS.get(self.signal, self.signal)} {spread}, and the model was "
             f"estimated on {low * factor:z.3g} to {high * factor:z.3g}{unit}."
         )
 

@@ -10,14 +10,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, SymmetricalLogLocator
 from numpy.typing import NDArray
 
-from greybox.channels import CHANNELS
+from greybox.channels import CHANNELS, MOTIONS
 from greybox.diagnosis.result import Gain, Ranked, Runs
 from greybox.report.error_profiles import Profile, profile
 from greybox.report.figures import (
     BLACK,
     BLUE,
     LABELS,
-    NAMES,
     SKY,
     VERMILION,
     draw_line,
@@ -48,7 +47,7 @@ _STYLE: Mapping[str, dict[str, Any]] = {
     "after": {"color": BLUE, "linestyle": "-", "marker": "o"},
     "simulated": {"color": BLUE, "linestyle": "-", "marker": "o"},
 }
-_SHORT = {state: f"{word} [{CHANNELS[state].unit}]" for state, word in NAMES.items()}
+_SHORT = {state: f"{word} [{CHANNELS[state].unit}]" for state, word in MOTIONS.items()}
 
 
 def run_figure(run: Runs, points: int = _POINTS) -> Figure:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.channels import MOTIONS
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.summary import (
@@ -34,7 +35,7 @@ from greybox.report.estimation_figures import (
     tried_figure,
     visited_figure,
 )
-from greybox.report.figures import NAMES, narrow, to_svg, told_fits
+from greybox.report.figures import narrow, to_svg, told_fits
 from greybox.report.model_difference import shown_unit, unbroken
 from greybox.report.next_steps import after_estimate
 from greybox.report.page import Page, Picture, Section, Table, capital, computed
@@ -309,7 +310,7 @@ def _residuals(estimate: EstimateValues) -> Section | None:
     if not own and not inputs:
         return None
     told = [
-        _sentence(f"{NAMES.get(s, s)}: {t.sentence}")
+        _sentence(f"{MOTIONS.get(s, s)}: {t.sentence}")
         for s in states
         for t in estimate.tests
         if t.state == s and t.kind in ("whiteness", "input_independence")
@@ -337,7 +338,7 @@ def _visited(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
     states = estimate.predictor.structure.states
     values = {s: np.concatenate([log[s] for log in logs]) for s in states}
     ranges = ", ".join(
-        f"{NAMES.get(s, s)} from {v.min():.2f} to {v.max():.2f}" for s, v in values.items()
+        f"{MOTIONS.get(s, s)} from {v.min():.2f} to {v.max():.2f}" for s, v in values.items()
     )
     margins = _margins(estimate)
     caption = "How much of the time each value was met, all logs together."
@@ -359,7 +360,7 @@ def _visited(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
         figure = regimes_figure(values["u"], values["v"])
         pictures.append(narrow(figure, "regimes", caption, f"{caption} {shares}."))
     told = [
-        _sentence(f"{NAMES.get(s, s)}: {t.sentence}")
+        _sentence(f"{MOTIONS.get(s, s)}: {t.sentence}")
         for s in states
         for t in estimate.tests
         if t.state == s and t.kind == "excitation"

@@ -14,6 +14,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from greybox.channels import MOTIONS
 from greybox.report.chart import Chart
 from greybox.report.page import Picture
 from greybox.report.thinning import find_gaps, pick, thin
@@ -39,7 +40,6 @@ LABELS = {
 
 
 # as sentences call the states
-NAMES = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
 # inches: letters stay legible where the page is 390 px wide
 _WIDTH = 5.2
 # fit from which on a run has not left the measurements for good [%]
@@ -213,7 +213,7 @@ def percent(fit: float, digits: int = 1) -> str:
 
 def told_fits(fit: Mapping[str, float], digits: int = 1) -> str:
     """Return the fit of each state in words."""
-    return ", ".join(f"{NAMES.get(s, s)} {percent(v, digits)}" for s, v in fit.items())
+    return ", ".join(f"{MOTIONS.get(s, s)} {percent(v, digits)}" for s, v in fit.items())
 
 
 def legend_columns(labels: Sequence[str], width: float, most: int = 3) -> int:

@@ -17,12 +17,11 @@ from experiment_design.constraints.limits import (
     TrialLimits,
     rounded_up,
 )
+from greybox.channels import MOTIONS
 from greybox.errors import UsageError
 from greybox.rotation import ned_to_body
 
 Array = NDArray[np.float64]
-
-WORDS = {"u": "surge", "v": "sway", "r": "yaw rate"}
 
 
 class FromZero(PathLimit):
@@ -83,7 +82,7 @@ class Margin(FromZero):
     @property
     def words(self) -> str:
         """The limit in words."""
-        return f"margin of {WORDS.get(self.state, self.state)}"
+        return f"margin of {MOTIONS.get(self.state, self.state)}"
 
     @property
     def unit(self) -> str:
@@ -164,7 +163,7 @@ class AirMargin(FromZero):
     @property
     def words(self) -> str:
         """The limit in words."""
-        return f"margin of {WORDS[self.state]} through the air"
+        return f"margin of {MOTIONS[self.state]} through the air"
 
     def value(self, at: Mapping[str, ca.SX]) -> ca.SX:
         """Return h."""
