@@ -33,6 +33,7 @@ from greybox.trial.checks.finding import CheckReport
 from greybox.trial.convert.read import read_log
 from greybox.trial.store import write_log
 from greybox.validation.comparison import Comparison, compare
+from greybox.validation.fit import LEFT
 from greybox.vessel.toml import load_vessel
 
 Array = NDArray[np.float64]
@@ -239,7 +240,7 @@ def _estimated(estimate: Estimate) -> Step:
 
 def _fits(comparison: Comparison, row: int) -> str:
     return ", ".join(
-        f"{MOTIONS[s]} {v:.1f} %" if v > -1000 else f"{MOTIONS[s]} diverged"
+        f"{MOTIONS[s]} {v:.1f} %" if v > LEFT else f"{MOTIONS[s]} diverged"
         for s, v in comparison.fits()[row].items()
     )
 

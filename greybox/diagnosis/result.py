@@ -16,6 +16,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.notebook import DisplayMixin, interval, items, number, table, text, with_error
 from greybox.trial.log import TrialLog
 from greybox.trial.validity import ConditionDifference
+from greybox.validation.fit import LEFT
 
 Array = NDArray[np.float64]
 
@@ -536,16 +537,23 @@ def _gain_lines(gain: Mapping[str, Gain], where: str) -> list[str]:
     return [
         f"Fit of the free run (6.12) [%], {where}:",
         *(
-            f"  {state:<3}{g.before:>8.1f} -> {g.after:.1f}   (gain {g.ci[0]:.1f} to {g.ci[1]:.1f})"
+            f"  {state:<3}{_fit(g.before):>8} -> {_fit(g.after)}{_gained(g, '   (gain {})')}"
             for state, g in gain.items()
         ),
     ]
 
 
+def _fit(value: float) -> str:
+    return f"{value:.1f}" if value > LEFT else "diverged"
+
+
+def _gained(gain: Gain, said: str = "{}") -> str:
+    """Return the interval of a gain; nothing where the run before has left the measurements."""
+    low, high = gain.ci
+    return said.format(f"{low:.1f} to {high:.1f}") if gain.before > LEFT else ""
+
+
 def _gain_table(gain: Mapping[str, Gain], where: str) -> str:
-    rows = [
-        (s, number(g.before, 3), number(g.after, 3), f"{g.ci[0]:.1f} to {g.ci[1]:.1f}")
-        for s, g in gain.items()
-    ]
+    rows = [(s, _fit(g.before), _fit(g.after), _gained(g)) for s, g in gain.items()]
     head = ("free run", "fit before [%]", "after", "gain, 95 %")
     return table(head, rows, f"Fit (6.12), {where}")

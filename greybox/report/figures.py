@@ -19,7 +19,7 @@ from greybox.report.chart import Chart
 from greybox.report.page import Picture
 from greybox.report.thinning import find_gaps, pick, thin
 from greybox.validation.bands import Bands
-from greybox.validation.fit import LogFit
+from greybox.validation.fit import LEFT, LogFit
 
 Array = NDArray[np.float64]
 
@@ -39,11 +39,8 @@ LABELS = {
 }
 
 
-# as sentences call the states
 # inches: letters stay legible where the page is 390 px wide
 _WIDTH = 5.2
-# fit from which on a run has not left the measurements for good [%]
-_LEFT = -1000.0
 
 # inches that each further row of a legend needs
 LEGEND_ROW = 0.17
@@ -208,7 +205,7 @@ def comparison_figure(
 
 def percent(fit: float, digits: int = 1) -> str:
     """Return a fit (6.12) [%] in words."""
-    return f"{fit:.{digits}f} %" if fit > _LEFT else "diverged"
+    return f"{fit:.{digits}f} %" if fit > LEFT else "diverged"
 
 
 def told_fits(fit: Mapping[str, float], digits: int = 1) -> str:

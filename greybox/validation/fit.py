@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _HUGE = 1e6
+# fit from which on a run has not left the measurements for good [%]
+LEFT = -1000.0
 # samples that a log has at least
 _HEAD = 2
 

@@ -16,7 +16,7 @@ from greybox.diagnosis.evidence.held_out import proof_of
 from greybox.diagnosis.gain import gains
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import context_of, prepare
-from greybox.diagnosis.result import Found, Quantity
+from greybox.diagnosis.result import Found, Gain, Quantity, _gain_lines
 from greybox.diagnosis.search import Candidate, _beside_others, freed, search
 from greybox.model.terms import mirror_sign, parse_term
 from greybox.study.blind import draw
@@ -190,3 +190,11 @@ def test_delay_and_lag_that_hold_a_run_within_bounds_are_one_kind_of_cause() -> 
     late = [held("input_delay", np.inf, True), held("thruster_lag", np.inf, True)]
     found = _beside_others([*late, held("clock_offset", -np.inf, False)])
     assert [c.proof.p_value for c in found] == [0.0, 0.0, 1.0]
+
+
+def test_a_run_that_has_left_the_measurements_is_told_as_such() -> None:
+    told = _gain_lines(
+        {"u": Gain(-6775.0, 61.7, (1.0, 2.0)), "v": Gain(10.0, 20.0, (5.0, 15.0))}, ""
+    )
+    assert told[1].split() == ["u", "diverged", "->", "61.7"]
+    assert told[2].split() == ["v", "10.0", "->", "20.0", "(gain", "5.0", "to", "15.0)"]
