@@ -52,4 +52,4 @@ LOGGED = ("t", "x_n", "y_n", "psi", "u", "v", "r", "u_q", "v_q")
 MOTIONS = frozenset({"x_n", "y_n", "psi", "u", "v", "r"})
 
 # how sentences, axes and tables name motions (SNAME, 1950)
-MOTIONS = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}
+MOTION_WORDS = {"u": "surge", "v": "sway", "r": "yaw rate", "psi": "heading"}

@@ -14,7 +14,7 @@ from experiment_design.design import design_trial
 from experiment_design.output.result import Design, write_plan
 from experiment_design.prepare import prepare_request
 from experiment_design.request.request import DesignRequest
-from greybox.channels import MOTIONS
+from greybox.channels import MOTION_WORDS
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.gain import gains
 from greybox.diagnosis.result import Diagnosis, Found
@@ -240,7 +240,7 @@ def _estimated(estimate: Estimate) -> Step:
 
 def _fits(comparison: Comparison, row: int) -> str:
     return ", ".join(
-        f"{MOTIONS[s]} {v:.1f} %" if v > LEFT else f"{MOTIONS[s]} diverged"
+        f"{MOTION_WORDS[s]} {v:.1f} %" if v > LEFT else f"{MOTION_WORDS[s]} diverged"
         for s, v in comparison.fits()[row].items()
     )
 
@@ -286,10 +286,10 @@ def _diagnosed(diagnosis: Diagnosis, hidden: Sequence[Effect]) -> Step:
 def _gained(compared: Comparison, sample_time: float, seed: int) -> Step:
     before, after = compared.runs
     told = [
-        f"{MOTIONS[s]} from {g.before:.1f} to {g.after:.1f} % (95 % interval of the gain "
+        f"{MOTION_WORDS[s]} from {g.before:.1f} to {g.after:.1f} % (95 % interval of the gain "
         f"{g.ci[0]:.1f} to {g.ci[1]:.1f})"
         for s, g in gains(before, after, sample_time, seed).items()
-        if s in MOTIONS
+        if s in MOTION_WORDS
     ]
     return Step(
         "Measure the gain",

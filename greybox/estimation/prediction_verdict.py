@@ -13,14 +13,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from greybox.channels import MOTIONS
+from greybox.channels import MOTION_WORDS
 from greybox.estimation.verdict import Divergence, Reason
 from greybox.notebook import DisplayMixin, number, table
 
 
 def channel_words(channel: str) -> str:
     """Return what a state is called, its symbol where it has no name."""
-    return MOTIONS.get(channel, channel)
+    return MOTION_WORDS.get(channel, channel)
 
 
 class PredictionLevel(StrEnum):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from greybox.channels import MOTIONS
+from greybox.channels import MOTION_WORDS
 from greybox.model.model import ManoeuvringModel
 from greybox.trial.log import TrialLog
 
@@ -45,8 +45,9 @@ class Extrapolation:
         spread = f"is {least * factor:z.3g}{unit}"
         if most > least:
             spread = f"goes from {least * factor:z.3g} to {most * factor:z.3g}{unit}"
+        said = MOTION_WORDS.get(self.signal, self.signal)
         return (
-            f"extrapolated: {MOTIONS.get(self.signal, self.signal)} {spread}, and the model was "
+            f"extrapolated: {said} {spread}, and the model was "
             f"estimated on {low * factor:z.3g} to {high * factor:z.3g}{unit}."
         )
 

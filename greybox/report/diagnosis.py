@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from greybox.channels import CHANNELS, MOTIONS
+from greybox.channels import CHANNELS, MOTION_WORDS
 from greybox.diagnosis.result import Diagnosis, Gain, Runs, hardly_split
 from greybox.report.chart import chart_of
 from greybox.report.diagnosed_causes import cause_section, probability
@@ -104,7 +104,7 @@ def _summary(diagnosis: Diagnosis) -> list[str]:
     told = [f"Verdict: {diagnosis.verdict}, after {diagnosis.tried} causes were tried."]
     if diagnosis.gain and _changed(diagnosis):
         gains = ", ".join(
-            f"{MOTIONS.get(s, s)} from {percent(g.before)} to {percent(g.after)}"
+            f"{MOTION_WORDS.get(s, s)} from {percent(g.before)} to {percent(g.after)}"
             for s, g in diagnosis.gain.items()
         )
         told.append(f"The fit of the free run (100 % is perfect) changes: {gains}.")
@@ -223,7 +223,7 @@ def _rms_sentence(errors: Errors) -> str:
     parts = []
     for state in errors.states:
         sizes = ", ".join(f"{errors.rms(name, state):.3g} {name}" for name in errors.error)
-        parts.append(f"{MOTIONS.get(state, state)} [{CHANNELS[state].unit}] {sizes}")
+        parts.append(f"{MOTION_WORDS.get(state, state)} [{CHANNELS[state].unit}] {sizes}")
     return f"Root mean square errors: {'; '.join(parts)}."
 
 
@@ -296,7 +296,7 @@ def gain_section(diagnosis: Diagnosis) -> Section:
 def _gain_table(caption: str, gain: Mapping[str, Gain], heads: tuple[str, str]) -> Table:
     rows = [
         [
-            MOTIONS.get(s, s), percent(g.before), percent(g.after),
+            MOTION_WORDS.get(s, s), percent(g.before), percent(g.after),
             f"{g.after - g.before:+.1f}" if percent(g.before) != "diverged" else "",
             f"{g.ci[0]:.1f} to {g.ci[1]:.1f}",
         ]

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, SymmetricalLogLocator
 from numpy.typing import NDArray
 
-from greybox.channels import CHANNELS, MOTIONS
+from greybox.channels import CHANNELS, MOTION_WORDS
 from greybox.diagnosis.result import Gain, Ranked, Runs
 from greybox.report.error_profiles import Profile, profile
 from greybox.report.figures import (
@@ -47,7 +47,7 @@ _STYLE: Mapping[str, dict[str, Any]] = {
     "after": {"color": BLUE, "linestyle": "-", "marker": "o"},
     "simulated": {"color": BLUE, "linestyle": "-", "marker": "o"},
 }
-_SHORT = {state: f"{word} [{CHANNELS[state].unit}]" for state, word in MOTIONS.items()}
+_SHORT = {state: f"{word} [{CHANNELS[state].unit}]" for state, word in MOTION_WORDS.items()}
 
 
 def run_figure(run: Runs, points: int = _POINTS) -> Figure:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from greybox.channels import MOTIONS
+from greybox.channels import MOTION_WORDS
 from greybox.diagnosis.budget import SENSOR
 from greybox.diagnosis.result import BudgetPart, Diagnosis, is_split, told_share
 from greybox.report.figures import BLUE, LABELS, ORANGE, legend_outside, new_figure, tidy
@@ -81,7 +81,7 @@ def noise_sentence(diagnosis: Diagnosis) -> str:
     told, bounds = [], []
     for state, own in sensor.after.items():
         share = min(max(own / max(sum(p.after[state] for p in budget), 1e-300), 0.0), 1.0)
-        name = MOTIONS.get(state, state)
+        name = MOTION_WORDS.get(state, state)
         told.append(f"{name} {100 * share:.0f} %")
         if noise is not None and held:
             std = float(noise.measurement[noise.states.index(state)])

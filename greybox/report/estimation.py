@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import MOTIONS
+from greybox.channels import MOTION_WORDS
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.summary import (
@@ -310,7 +310,7 @@ def _residuals(estimate: EstimateValues) -> Section | None:
     if not own and not inputs:
         return None
     told = [
-        _sentence(f"{MOTIONS.get(s, s)}: {t.sentence}")
+        _sentence(f"{MOTION_WORDS.get(s, s)}: {t.sentence}")
         for s in states
         for t in estimate.tests
         if t.state == s and t.kind in ("whiteness", "input_independence")
@@ -338,7 +338,7 @@ def _visited(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
     states = estimate.predictor.structure.states
     values = {s: np.concatenate([log[s] for log in logs]) for s in states}
     ranges = ", ".join(
-        f"{MOTIONS.get(s, s)} from {v.min():.2f} to {v.max():.2f}" for s, v in values.items()
+        f"{MOTION_WORDS.get(s, s)} from {v.min():.2f} to {v.max():.2f}" for s, v in values.items()
     )
     margins = _margins(estimate)
     caption = "How much of the time each value was met, all logs together."
@@ -360,7 +360,7 @@ def _visited(estimate: Estimate, logs: Sequence[TrialLog]) -> Section:
         figure = regimes_figure(values["u"], values["v"])
         pictures.append(narrow(figure, "regimes", caption, f"{caption} {shares}."))
     told = [
-        _sentence(f"{MOTIONS.get(s, s)}: {t.sentence}")
+        _sentence(f"{MOTION_WORDS.get(s, s)}: {t.sentence}")
         for s in states
         for t in estimate.tests
         if t.state == s and t.kind == "excitation"

@@ -14,7 +14,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from greybox.channels import MOTIONS
+from greybox.channels import MOTION_WORDS
 from greybox.report.chart import Chart
 from greybox.report.page import Picture
 from greybox.report.thinning import find_gaps, pick, thin
@@ -210,7 +210,7 @@ def percent(fit: float, digits: int = 1) -> str:
 
 def told_fits(fit: Mapping[str, float], digits: int = 1) -> str:
     """Return the fit of each state in words."""
-    return ", ".join(f"{MOTIONS.get(s, s)} {percent(v, digits)}" for s, v in fit.items())
+    return ", ".join(f"{MOTION_WORDS.get(s, s)} {percent(v, digits)}" for s, v in fit.items())
 
 
 def legend_columns(labels: Sequence[str], width: float, most: int = 3) -> int:

@@ -17,7 +17,7 @@ from experiment_design.constraints.limits import (
     TrialLimits,
     rounded_up,
 )
-from greybox.channels import MOTIONS
+from greybox.channels import MOTION_WORDS
 from greybox.errors import UsageError
 from greybox.rotation import ned_to_body
 
@@ -82,7 +82,7 @@ class Margin(FromZero):
     @property
     def words(self) -> str:
         """The limit in words."""
-        return f"margin of {MOTIONS.get(self.state, self.state)}"
+        return f"margin of {MOTION_WORDS.get(self.state, self.state)}"
 
     @property
     def unit(self) -> str:
@@ -163,7 +163,7 @@ class AirMargin(FromZero):
     @property
     def words(self) -> str:
         """The limit in words."""
-        return f"margin of {MOTIONS[self.state]} through the air"
+        return f"margin of {MOTION_WORDS[self.state]} through the air"
 
     def value(self, at: Mapping[str, ca.SX]) -> ca.SX:
         """Return h."""
