@@ -309,6 +309,18 @@ def error_budget(
     )
 
 
+def without_share(budget: Sequence[BudgetPart], causes: Sequence[str]) -> list[str]:
+    """Say which causes have no share of the error, and why."""
+    told = {part.part for part in budget}
+    lacking = [cause for cause in causes if cause not in told]
+    if not budget or not lacking:
+        return []
+    return [
+        f"no share of the error is told of {', '.join(lacking)}: without it no free run stays within "
+        f"bounds, so it is part of what is not split."
+    ]
+
+
 def _states(held: Problem, fit: Fit) -> Array:
     """Return the held-out errors of the states, (N, nx), zero where nothing was measured."""
     return np.concatenate(fit.errors)[:, : len(held.structure.states)] * _measured([held])

@@ -16,6 +16,7 @@ from greybox.diagnosis.budget import (
     error_budget,
     errors_before,
     errors_without,
+    without_share,
 )
 from greybox.diagnosis.causes import Cause
 from greybox.diagnosis.evidence.confusion import rivals
@@ -158,7 +159,13 @@ class DiagnosisBuilder:
         members = [c for pair in groups for c in pair]
         alternatives = {c.hypothesis.id: self.model(c.fit, self.record((c,))) for c in members}
         told = after if final is found.final else before
-        notes = [*self._notes(after), *ruling.notes, *diverging(told, validate or case.logs)]
+        budget = self._budget(final, ruling.named, lines[1])
+        notes = [
+            *self._notes(after),
+            *ruling.notes,
+            *without_share(budget, list(by_name(ruling.named))),
+            *diverging(told, validate or case.logs),
+        ]
         return Diagnosis(
             verdict=ruling.verdict,
             causes=(*known, *(self.cause(c, final) for c in ruling.named)),
@@ -187,7 +194,7 @@ class DiagnosisBuilder:
             notes=tuple(notes),
             tried=tried,
             record=self.record(found.causes),
-            budget=self._budget(final, ruling.named, lines[1]),
+            budget=budget,
         )
 
     def _budget(

@@ -8,12 +8,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from greybox.diagnosis.budget import MOTION, REST, SENSOR, SwitchedOff, error_budget, errors_without
+from greybox.diagnosis.budget import (
+    MOTION,
+    REST,
+    SENSOR,
+    SwitchedOff,
+    error_budget,
+    errors_without,
+    without_share,
+)
 from greybox.diagnosis.builder import by_name, leave_out
 from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.preparing import prepare
+from greybox.diagnosis.result import BudgetPart
 from greybox.study.blind import draw
 
 
@@ -177,3 +186,10 @@ def test_a_current_takes_what_it_would_if_it_were_not_there() -> None:
     for state in ("u", "v"):
         one, other = (float(((r.measured[state] - r.before[state]) ** 2).sum()) for r in held)
         assert share[state] == pytest.approx(1 - other / one, abs=0.10)
+
+
+def test_a_cause_without_which_no_run_has_bounds_is_said_to_have_no_share() -> None:
+    part = BudgetPart("current", {"u": 0.4}, {"u": (0.3, 0.5)}, {"u": 0.0})
+    (said,) = without_share([part], ["current", "inertia_coupling"])
+    assert "no share of the error is told of inertia_coupling" in said
+    assert without_share([part], ["current"]) == without_share([], ["current"]) == []
