@@ -47,6 +47,7 @@ from greybox.diagnosis.ruling import rule
 from greybox.diagnosis.search import Candidate, Search, Step, backwards, instead
 from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.symptoms import find_symptoms
+from greybox.diagnosis.thresholds import WORTH
 from greybox.diagnosis.waves import Waves
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
@@ -377,9 +378,23 @@ class DiagnosisBuilder:
                 "the velocities to the origin, which adds the noise of the yaw rate, times the "
                 "lever arm, to u and v."
             )
+        kept = kept_without_name(self.found)
+        if kept:
+            out.append(
+                f"the extended model keeps {', '.join(kept)}, no better than a generic force: "
+                f"without it held-out free runs are worse by more than {WORTH:.0%} of the squared "
+                f"error."
+            )
         for change in after.changes:
             out.append(f"the extended model tells the log's own clock: {change.sentence}.")
         return out
+
+
+def kept_without_name(found: Search) -> list[str]:
+    """Return what is in force in the end though it does not stand: ids of causes."""
+    named = {c.hypothesis.key for c in found.causes}
+    left = {h.key for h in found.final.point.hypotheses} - named
+    return list(dict.fromkeys(c.hypothesis.id for c in found.leaning if c.hypothesis.key in left))
 
 
 def diverging(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> list[str]:

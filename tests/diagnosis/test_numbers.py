@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from designs import thesis_model
 from virtual import virtual_log
 
+from greybox.diagnosis.builder import kept_without_name
 from greybox.diagnosis.causes import known_causes
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.evidence.held_out import proof_of
@@ -198,3 +200,16 @@ def test_a_run_that_has_left_the_measurements_is_told_as_such() -> None:
     )
     assert told[1].split() == ["u", "diverged", "->", "61.7"]
     assert told[2].split() == ["v", "10.0", "->", "20.0", "(gain", "5.0", "to", "15.0)"]
+
+
+def test_what_stays_in_force_without_standing_is_named_in_a_note() -> None:
+    def candidate(key: str) -> Candidate:
+        hypothesis = Hypothesis(key.split(":")[0], key, (), (), place=key.partition(":")[2])
+        return Candidate(hypothesis, None, 1.0, 0.0, 0.0, proof_of(np.ones(3)))
+
+    current, lag, gone = (candidate(k) for k in ("current", "thruster_lag:delta", "lever_arm"))
+    point = SimpleNamespace(hypotheses=(current.hypothesis, lag.hypothesis))
+    found = SimpleNamespace(
+        causes=(current,), leaning=(lag, gone), final=SimpleNamespace(point=point)
+    )
+    assert kept_without_name(found) == ["thruster_lag:delta"]
