@@ -20,6 +20,7 @@ from greybox.diagnosis.ruling import leaves_more
 from greybox.diagnosis.search import search, weighed
 from greybox.diagnosis.waves import find_waves, found_waves
 from greybox.estimation.prediction_verdict import JudgedOn
+from greybox.estimation.verdict import UNJUDGED
 from greybox.model.model import ManoeuvringModel
 from greybox.numerics.threads import one_thread
 from greybox.public import known_keywords
@@ -220,7 +221,11 @@ def _with_prediction(made: Diagnosis, validate: Sequence[TrialLog], seed: int) -
         return made
     runs = [HeldOut.of(made.model, log) for log in validate]
     verdict = judge_prediction(runs, JudgedOn.VALIDATION, seed=seed)
-    record = {**made.model.record, "verdict": {"prediction": verdict.to_dict()}}
+    told = {
+        "prediction": verdict.to_dict(),
+        "coefficients": UNJUDGED.to_dict() | {"of": "theta"},
+    }
+    record = {**made.model.record, "verdict": told}
     return replace(made, model=replace(made.model, record=record))
 
 
