@@ -19,8 +19,6 @@ from greybox.diagnosis.result import Diagnosis
 from greybox.diagnosis.ruling import leaves_more
 from greybox.diagnosis.search import search, weighed
 from greybox.diagnosis.waves import find_waves, found_waves
-from greybox.estimation.prediction_verdict import JudgedOn
-from greybox.estimation.verdict import UNJUDGED
 from greybox.model.model import ManoeuvringModel
 from greybox.numerics.threads import one_thread
 from greybox.public import known_keywords
@@ -32,7 +30,6 @@ from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.trial.segments import as_segments
 from greybox.trial.validity import other_conditions, pooled_conditions
 from greybox.validation.fit import at_model_rate
-from greybox.validation.judge_prediction import HeldOut, judge_prediction
 
 _log = logging.getLogger(__name__)
 
@@ -209,24 +206,7 @@ def diagnose(
     if options.remainder:
         say("a black-box part")
         made = with_remainder(case, report.fit_told, made, ready.validate, options.seed)
-    return replace(_with_prediction(made, ready.validate, options.seed), conditions=conditions)
-
-
-def _with_prediction(made: Diagnosis, validate: Sequence[TrialLog], seed: int) -> Diagnosis:
-    """Return a diagnosis whose model holds how its free runs predict the logs that were held out.
-
-    What is predicted with it is as uncertain as that.
-    """
-    if not validate:
-        return made
-    runs = [HeldOut.of(made.model, log) for log in validate]
-    verdict = judge_prediction(runs, JudgedOn.VALIDATION, seed=seed)
-    told = {
-        "prediction": verdict.to_dict(),
-        "coefficients": UNJUDGED.to_dict() | {"of": "theta"},
-    }
-    record = {**made.model.record, "verdict": told}
-    return replace(made, model=replace(made.model, record=record))
+    return replace(made, conditions=conditions)
 
 
 def _at_rate_of(
