@@ -316,8 +316,8 @@ def without_share(budget: Sequence[BudgetPart], causes: Sequence[str]) -> list[s
     if not budget or not lacking:
         return []
     return [
-        f"no share of the error is told of {', '.join(lacking)}: without it no free run stays "
-        f"within bounds, so it is part of what is not split."
+        f"no share of the error is told of {', '.join(lacking)}: where that is left out, no free "
+        f"run stays within bounds, so it is part of what is not split."
     ]
 
 

@@ -166,14 +166,15 @@ class Problem:
         """Least coefficients (p,): more damping would look like less, as steps alternate."""
         limit = MONOTONE[self.runs[0].integrator]
         found = np.full(len(self.structure.terms), -np.inf)
-        motion = np.concatenate([run.y for run in self.runs])
+        motion = np.abs(np.concatenate([run.y for run in self.runs])).T
+        moved = dict(zip(self.runs[0].outputs, motion, strict=True))
         for i, term in enumerate(self.structure.terms):
             if term.dissipates and {f.signal for f in term.factors} <= set(self.structure.states):
                 # of what acts as linear damping that takes as much energy out
-                y = dict(zip(self.runs[0].outputs, np.abs(motion).T, strict=True))
-                force = np.prod([y[f.signal] for f in term.factors if not f.bump], axis=0)
-                taken = float((force * y[term.state]).sum())
-                found[i] = limit * float((y[term.state] ** 2).sum()) / taken if taken else -np.inf
+                own = moved[term.state]
+                force = np.prod([moved[f.signal] for f in term.factors if not f.bump], axis=0)
+                if (taken := float((force * own).sum())) > 0:
+                    found[i] = limit * float((own**2).sum()) / taken
         return found
 
     def bounds(self, point: Point) -> tuple[Array, Array]:

@@ -443,15 +443,9 @@ def _moving(
     follows them, may still have the best mean over the channels of short parts.
     """
     moves = spread > 0
-    found = [_of_size(whole[begun], size) for begun, size in alternatives]
-    ratio = np.array(
-        [
-            np.mean(np.concatenate(selection.errors(s.p))[:, moves] ** 2, axis=0)
-            if s
-            else np.full(moves.sum(), np.inf)
-            for s in found
-        ]
-    ) / spread[moves] ** 2  # fmt: skip
+    sets = [found for b, n in alternatives if (found := _of_size(whole[b], n))]
+    errors = [np.concatenate(selection.errors(found.p))[:, moves] for found in sets]
+    ratio = np.mean(np.square(errors), axis=1) / spread[moves] ** 2
     rests = (ratio >= 1) & (ratio > _LOST * ratio.min(axis=0))
     return [a for a, still in zip(alternatives, rests.any(axis=1), strict=True) if not still]
 
