@@ -176,9 +176,8 @@ def design_trial(
                 raise InfeasibleError(sentence)
             status = CLOSEST
             notes.append(sentence)
-    if (told := request.out_of_reach) is not None:
+    if request.out_of_reach is not None:
         status = CLOSEST
-        notes += [told.sentence, f"this plan was designed for {request.stand_ins} instead"]
     keeping: ConstraintSatisfaction | None = None
     if request.uncertain and not stopped:
         try:
@@ -282,7 +281,8 @@ def described(
         motions = (_behind(request, run_through(request, levels[0])),)
     reports = _limit_reports(request, problems, motions, levels)
     late = late_notes(request, problems, motions, reports, covariance)
-    if request.out_of_reach is not None:
+    if (told := request.out_of_reach) is not None:
+        notes = (told.sentence, *notes, f"this plan was designed for {request.stand_ins} instead")
         asked = request.as_asked()
         reports = _limit_reports(
             asked, [build_problem(asked, t) for t in range(asked.trials)], motions, levels

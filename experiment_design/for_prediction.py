@@ -70,7 +70,8 @@ class PredictionDesign:
         forces beyond the prior's terms that the trial does not tell.
     random : float
         Root mean squared error of the median of random sequences of the same length, over
-        that of the plan; nan for several trials, where it is not known.
+        that of the plan, of those that keep the limits; nan where none does, and for several
+        trials, where it is not known.
     commands : dict of str to (float, float)
         Range of each command in the envelope, in the log's unit, angles in rad.
     crossings : tuple of (float, float)
@@ -374,7 +375,7 @@ def design_for_prediction(
     missed = diagnosed_misfit(model) if level == _DIAGNOSED else {}
     # no cause that a diagnosis knows, and no coefficient, explained it
     unknown = np.maximum(unknown, [missed.get(s, 0.0) ** 2 for s in states])
-    kept = searches[0].random[np.isfinite(searches[0].random)]
+    kept = searches[0].random
     random = float(np.median(np.exp(-kept))) if len(kept) else float("nan")
     v = states.index("v") if "v" in states else None
     crossings: tuple[tuple[float, float], ...] = ()
@@ -506,19 +507,17 @@ def described_plan(
         for p, search in zip(problems, searches, strict=True)
         for change in least_change(p, assess(p, search.candidate.unit[None])[0])
     ]
-    if short and request.out_of_reach is not None and all(x.of_regime for x, _ in short):
-        # what stands in for a margin is then what the plan keeps
-        for limit, amount in sorted(short, key=lambda item: item[1]):
-            request = replace(request, limits=limit.eased(request.limits, amount)[0])
-    elif short:
+    if short:
         sentence = _lacking(request, *max(short, key=lambda item: item[1] / item[0].scale))
         if not best_effort:
             raise InfeasibleError(sentence)
-        status = CLOSEST
         notes.append(sentence)
-    if (told := request.out_of_reach) is not None:
+        if request.out_of_reach is not None and all(x.of_regime for x, _ in short):
+            # what stands in for a margin is then what the plan keeps
+            for limit, amount in sorted(short, key=lambda item: item[1]):
+                request = replace(request, limits=limit.eased(request.limits, amount)[0])
+    if notes or request.out_of_reach is not None:
         status = CLOSEST
-        notes += [told.sentence, f"this plan keeps {request.stand_ins} instead"]
     design = described(
         request, problems, [s.candidate.unit for s in searches], None, 0,
         certificate=absent(certificate), keeping=keeping, status=status,

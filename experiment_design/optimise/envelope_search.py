@@ -51,19 +51,21 @@ class EnvelopeSearch:
     candidate : Candidate
         Its value is what was searched for: −½ log of the mean squared error of predictions.
     random : ndarray
-        (R,) values of the random sequences, −inf where a run is unstable.
+        (kept,) values of the random sequences that keep the limits.
     reference : Candidate
         The best of these, of those that keep the limits where some do.
-    kept : int
-        How many of these keep the limits.
     evaluations : int
     """
 
     candidate: Candidate
     random: Array
     reference: Candidate
-    kept: int
     evaluations: int
+
+    @property
+    def kept(self) -> int:
+        """How many of the random sequences keep the limits."""
+        return len(self.random)
 
 
 def usual_manoeuvres(envelope: Envelope, holds: int, hold: float) -> Array:
@@ -297,12 +299,12 @@ def exchange_settings(
         return pool[0]
 
     found = better(map_forked(chain, range(_CHAINS), workers=workers))
-    values = np.array([c.value for _, c in random])
     # the sides and speeds that a sequence goes to are no limits of the trial
     keeping = [(p, c) for p, c in random if (c.missed[:-1] <= TOLERANCE).all()]
     rival = better(keeping or random)[0]
     best, reference = (replace(c, missed=c.missed[:-1]) for _, c in (found[0], rival))
-    return EnvelopeSearch(best, values, reference, len(keeping), RANDOM + _CHAINS * rounds * tries)
+    values = np.array([c.value for _, c in keeping])
+    return EnvelopeSearch(best, values, reference, RANDOM + _CHAINS * rounds * tries)
 
 
 def one_sided(envelope: Envelope, motion: Motion) -> Array:

@@ -479,11 +479,18 @@ def test_the_closest_plan_to_a_margin_out_of_reach(model) -> None:
     # so long a plan does not go to both sides at this speed
     limits = TrialLimits(margins={"u": 2.1})
     request = request_of(duration=300.0, effort=0.01, limits=limits, out_of_reach=told)
-    design = design_for_prediction(request, model, best_effort=True).design
+    found = design_for_prediction(request, model, best_effort=True)
+    design = found.design
     assert design.status == CLOSEST
-    assert "no motion keeps 9 m/s." in design.notes
     kept = design.margins["u"]
     assert kept < 2.1
+    # no random steps keep it either, so there are none to beat
+    assert design.random_kept == 0
+    assert "after random steps" not in found.headline()
+    # the margin that it keeps is lower than the one that was to stand in
+    assert "no motion keeps 9 m/s." in design.notes
+    assert f"Use {design.request.stand_ins}, or shorten the trial." in " ".join(design.notes)
+    assert f"this plan was designed for {design.request.stand_ins} instead" in design.notes
     # it hardly moves the ship
     assert any(n.startswith("after this trial the mean would predict") for n in design.notes)
     assert design.request.stand_ins == f"--margin-u {np.floor(1e3 * kept) / 1e3:g}"
