@@ -83,7 +83,7 @@ def _show(text: str, done: int = 0, total: int | None = None) -> None:
             console=Console(stderr=True), transient=True, speed_estimate_period=float("inf"),
             redirect_stdout=False, redirect_stderr=False,
         )  # fmt: skip
-        bar.add_task("")
+        bar.add_task("", total=total)
         bar.start()
         _shown.append(bar)
     task = _shown[0].task_ids[0]

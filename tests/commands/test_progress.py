@@ -54,6 +54,27 @@ def test_progress_shows_and_clears():
     assert on_the_screen(shown) == ""
 
 
+def test_the_words_of_progress_follow_the_work():
+    """Work without counted steps is told by what is done now, not by what was done first."""
+    script = """
+import logging
+from greybox.commands.common import progress
+from greybox.commands.terminal import telling
+log, show = logging.getLogger("greybox.any"), progress("refits")
+with telling(0, False):
+    for text in ("read the log", "chose a way"):
+        log.info(text)
+    show(1, 2)
+    log.info("a part of a step")
+    show(2, 2)
+    log.info("wrote the model")
+"""
+    _, shown = on_a_terminal("-c", script)
+    for text in ("read the log", "chose a way", "refits: 1 of 2", "wrote the model"):
+        assert text in shown
+    assert "a part of a step" not in shown
+
+
 def test_an_error_takes_the_place_of_progress():
     """A command that fails half way leaves its one sentence alone on the line."""
     script = SCRIPT.replace("range(1, 4)", "range(1, 3)") + (
