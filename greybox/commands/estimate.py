@@ -275,23 +275,29 @@ _ONLY = {
 
 
 def _require_heeded(options: argparse.Namespace) -> None:
-    """Raise where an option is given that the method that is named does not heed."""
+    """Raise where an option is given that the method may not heed, named or chosen."""
     from greybox.errors import UsageError
 
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     for methods, names in _ONLY.items():
-        for name in names if options.method not in (None, *methods) else ():
+        for name in names if options.method not in methods else ():
             # measured is how it is done where nothing is asked for
             if getattr(options, name) in (parser.get_default(name), "measured"):
                 continue
+            option = f"--{name.replace('_', '-')}"
+            only = f"{option} applies to --method {' and '.join(methods)} only"
+            if options.method is None:
+                raise UsageError(
+                    f"{only}, and without --method the data may choose another one: add --method "
+                    f"{' or '.join(methods)}, or leave {option} out."
+                )
             # a method that is typed wins over a file, one that the file names contradicts it
             if "method" in configured(options) or not leave_to_others(
                 options, name, parser.get_default(name)
             ):
                 raise UsageError(
-                    f"--{name.replace('_', '-')} applies to --method {' and '.join(methods)} "
-                    f"only, but --method is {options.method}: leave one of them out."
+                    f"{only}, but --method is {options.method}: leave one of them out."
                 )
 
 

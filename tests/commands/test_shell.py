@@ -215,8 +215,7 @@ def test_names_in_a_vessel_file_are_suggested(
          "--structure", "--compare-structures", 1),
         ("diagnose trial.csv --vessel V --model m.json --structure linear",
          "--model", "--structure", 2),
-        *((f"estimate trial.csv --vessel V --method {method} {given}",
-           given.split()[0], f"--method is {method}", 1)
+        *((f"estimate trial.csv --vessel V {named} {given}", given.split()[0], told, 1)
           for given, methods in {
               "--instruments mean-kept": "ls oe", "--prefilter none": "ls oe",
               "--heading simulated": "ls", "--nominal m.json": "ls",
@@ -224,7 +223,9 @@ def test_names_in_a_vessel_file_are_suggested(
               "--weights deviation": "ls iv", "--shooting multiple": "ls iv",
               "--bound Xu=-1:0": "ls iv", "--prior Xu=-1:1": "ls iv",
               "--damping enforce": "ls iv",
-          }.items() for method in methods.split()),
+          }.items() for named, told in (
+              ("", "add --method"),
+              *((f"--method {m}", f"--method is {m}") for m in methods.split()))),
         ("estimate trial.csv --vessel V --method oe --margin-u 1", "--margin-u", "--method iv", 1),
         ("import trial.csv --vessel V --out o.csv --fix-not sign", "--fix-not", "--fix", 1),
         ("import trial.csv --vessel V --out o.csv --fix-also sign --fix-not sign",
