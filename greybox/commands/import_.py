@@ -187,8 +187,8 @@ def run(options: argparse.Namespace) -> None:
         reader={"topics": topics} if topics else {},
         extra=provenance(options),
     )
+    records: list[Any] = [read_record(log) for log in logs]
     if options.json:
-        records: list[Any] = [read_record(log) for log in logs]
         write_json({"logs": records} if folder else records[0], options.json)
     if options.json != "-":
         say(summary)
@@ -198,7 +198,8 @@ def run(options: argparse.Namespace) -> None:
         written = ", ".join(str(log) for log in logs)
         beside = "its record" if len(logs) == 1 else "their records"
         say(f"wrote {written} and {record_path(logs[0]).name if not folder else beside}")
-        show_next([after_import(options.out, options.vessel)])
+        lacking = [c for c in vessel.commands if any(c not in r["units"] for r in records)]
+        show_next([after_import(options.out, options.vessel, lacking)])
 
 
 def import_options(options: argparse.Namespace) -> ImportOptions:

@@ -56,8 +56,13 @@ def typed(record: Mapping[str, Any], option: str, stand_in: str) -> str:
     return shlex.join(several)
 
 
-def after_import(out: str, vessel: str) -> NextStep:
-    """Return what to do with the log, or the folder of logs, that was written."""
+def after_import(out: str, vessel: str, lacking: Sequence[str] = ()) -> NextStep:
+    """Return what to do with the log, or the folder of logs, which lacks these commands."""
+    if lacking:
+        return NextStep(
+            f"Name the raw column of {' and that of '.join(lacking)}, with its unit, in the vessel "
+            f"file's [columns], and import again: a model needs what moves the thrusters"
+        )
     return NextStep(
         "See whether sensors and the vessel file are right",
         f"greybox check {shlex.quote(out)} --vessel {shlex.quote(vessel)} --report check.html",

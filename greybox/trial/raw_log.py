@@ -103,6 +103,8 @@ class Recording(DisplayMixin):
         samples [s], where the file holds both.
     unsure : frozenset of str
         Signals of which the file does not tell the axes: read as REP 103 has it.
+    unused : tuple of str
+        Columns of a table that nothing was made of.
     """
 
     name: str
@@ -117,6 +119,7 @@ class Recording(DisplayMixin):
     conditions: Conditions = field(default_factory=Conditions)
     ahead: float | None = None
     unsure: frozenset[str] = frozenset()
+    unused: tuple[str, ...] = ()
 
     def __contains__(self, name: object) -> bool:
         return any(s.name == name for s in self.signals)

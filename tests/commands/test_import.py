@@ -155,6 +155,25 @@ def test_a_mapping_that_no_file_has_is_told(tmp_path, capsys):
     )
     assert status == 0
     assert "[columns] maps 'Wind U' to 'u_q', which no file has" in out
+    assert "next: see whether sensors" in out
+
+
+def test_a_thruster_column_that_is_misspelt_gets_its_name_and_comes_before_the_checks(
+    tmp_path, capsys
+):
+    ship = tmp_path / "ship.toml"
+    ship.write_text(
+        'name = "S"\nlength = 5\n[[thruster]]\ntype = "azimuth"\nspeed = "n"\nangle = "aft"\n'
+        '[columns]\n"Azimuth PS" = "aft"\n'
+    )
+    raw = data().rename(columns={"alpha1": "Azimuth PS [rad]"})
+    raw.to_csv(tmp_path / "raw.csv", index=False)
+    given = ["import", tmp_path / "raw.csv", "--vessel", ship, "--out", tmp_path / "o.csv"]
+    status, out, _ = run(capsys, *given)
+    assert status == 0
+    assert "'aft', which no file has. Did you mean 'Azimuth PS [rad]'?\n" in out
+    assert "next: name the raw column of aft, with its unit, in the vessel file's [columns]" in out
+    assert "greybox check" not in out
 
 
 def sparse(path):

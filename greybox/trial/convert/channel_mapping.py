@@ -327,7 +327,14 @@ def batch_recording(
         )
     if alone and not set(assigned) & MOTION:
         notes.append(_NO_MOTION)
-    return Recording(table.path.stem, tuple(signals), text, scale.epoch, notes=tuple(notes))
+    return Recording(
+        table.path.stem,
+        tuple(signals),
+        text,
+        scale.epoch,
+        notes=tuple(notes),
+        unused=tuple(ignored),
+    )
 
 
 def canonical(
@@ -447,8 +454,10 @@ def unused_mappings(recordings: Iterable[Recording], vessel: Vessel) -> list[str
     for one, other in _ALTERNATIVES:
         if names.issuperset(one):
             names.update(other)
+    unused = [c for r in recordings for c in r.unused]
     return [
         f"[columns] maps '{raw}' to '{m.name}', which no file has"
+        + (f".{near}" if (near := suggestion(raw, unused)) else "")
         for raw, m in vessel.columns.items()
         if m.name not in names and m.name != "t"
     ]
