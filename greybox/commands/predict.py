@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from greybox.report.page import Page
     from greybox.trial.log import TrialLog
 
+# of the ships that MSC.137(76) is for [m]
+_LEAST_LENGTH = 100.0
 HELP = "predict standard manoeuvres, with intervals and the IMO limits"
 EXAMPLES = """examples:
   greybox predict model.json turning --speed 7.5
@@ -138,6 +140,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.model.model import load_model
     from greybox.prediction.predict import predict_manoeuvre
     from greybox.report.next_steps import after_prediction, typed
+    from greybox.trial.manoeuvres import Compliance
 
     check_targets(options.json, options.report, options.out)
     angles = [_angle(text) for text in options.angle]
@@ -168,6 +171,14 @@ def run(options: argparse.Namespace) -> None:
         trial=trial,
         progress=progress("manoeuvres"),
     )
+    length = model.vessel.length * options.scale
+    verdicts = {c.verdict for m in made.manoeuvres for c in m.criteria}
+    if length < _LEAST_LENGTH and verdicts - {Compliance.NOT_APPLICABLE}:
+        told = (
+            *told,
+            f"the limits of IMO MSC.137(76) are for ships of {_LEAST_LENGTH:g} m and more, and "
+            f"this one is {length:g} m long: for the model of a longer ship give --scale.",
+        )
     made = replace(made, notes=(*told, *made.notes))
     record = provenance(options)
     written = _write_runs(made, options.out) if options.out else []

@@ -108,7 +108,9 @@ def test_a_plan_of_commands_is_simulated_from_a_start(noisy_csv, tmp_path, capsy
     np.savetxt(plan, np.column_stack([t, 0 * t + 15, 0 * t + 0.8, 0 * t + 0.8]), delimiter=",",
                header="t,n,alpha1,alpha2", comments="")  # fmt: skip
     assert run("simulate", model, plan, "--out", tmp_path / "r.csv") == 1
-    assert "cannot be derived" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "cannot be derived" in error
+    assert error.endswith("; commands alone are simulated with --start.\n")
     assert run("simulate", model, plan, "--start", "1.5,1.2,0,0", "--out", tmp_path / "r.csv") == 0
     assert run("simulate", model, plan, "--start", "1.5,1.2", "--out", tmp_path / "r.csv") == 1
     assert "four numbers are needed" in capsys.readouterr().err

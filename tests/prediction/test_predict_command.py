@@ -36,6 +36,7 @@ def test_a_turn_is_predicted_written_and_shown(model, tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "Turning circle of Rudder ship, predicted" in shown
     assert "IMO advance, at most 4.5 L: meets" in shown
+    assert "are for ships of 100 m and more, and this one is 20 m long" in shown
     data = json.loads(result.read_text())
     rows = {(r["side"], r["name"]): r for r in data["quantities"]}
     row = rows["starboard", "tactical_diameter"]

@@ -28,6 +28,7 @@ from greybox.trial.convert.channel_mapping import (
 from greybox.trial.convert.column_names import Assigned
 from greybox.trial.convert.convert import Conversion, cut_segments
 from greybox.trial.convert.deduplicate import clean_signals
+from greybox.trial.convert.derived_signals import MOTION_SIGNALS
 from greybox.trial.convert.options import ImportOptions
 from greybox.trial.convert.time_grid import MIN_SEGMENT, Plan
 from greybox.trial.convert.time_scale import LATEST, time_scale
@@ -399,9 +400,11 @@ def _require(
     for state in states:
         if state not in channels:
             need = "psi and x_n, y_n" if state in "uv" else "psi"
+            still = not channels.keys() & set(MOTION_SIGNALS)
             raise LogError(
                 f"'{name}' has no '{state}' and it cannot be derived without {need}."
-                f"{suggestion(state, free)} Map the columns in the vessel file's [columns]."
+                f"{suggestion(state, free)} Map the columns in the vessel file's [columns]"
+                + ("; commands alone are simulated with --start." if still else ".")
             )
     if "psi" not in channels and set(states) & {"v", "r"}:
         raise LogError(
