@@ -84,7 +84,7 @@ def _proofs(found: Sequence[Found], tried: int) -> Table | None:
 
 
 def _falls(cause: Found) -> list[str]:
-    if not cause.gain:
+    if np.isnan(cause.gain):
         return _OUTSIDE
     if not np.isfinite(cause.held_out):
         return [f"{cause.gain:.1f}", cause.proved]
@@ -119,10 +119,15 @@ def _ranking(diagnosis: Diagnosis, kept: Sequence[str]) -> Iterator[Picture]:
         more = (
             f" The other {len(step) - len(shown)} are not drawn." if len(step) > len(shown) else ""
         )
+        named = (
+            "Bold: the causes that the verdict names."
+            if any(r.key in kept for r in shown)
+            else "The verdict names none of these."
+        )
         caption = (
             f"Step {i + 1} of the search: fall of −2 log L of each cause as its sensitivity "
             f"predicts it, as a refit finds it, and as held-out logs confirm it (95 % interval). "
-            f"Bold: the causes that the verdict names.{more}"
+            f"{named}{more}"
         )
         gain = "was not refitted" if best.gain is None else f"gained {best.gain:.0f}"
         alternative = (

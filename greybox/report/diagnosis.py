@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from greybox.channels import CHANNELS, MOTION_WORDS
-from greybox.diagnosis.result import Diagnosis, Gain, Runs, hardly_split
+from greybox.diagnosis.result import Diagnosis, Gain, Runs, hardly_split, is_split
 from greybox.report.chart import chart_of
 from greybox.report.diagnosed_causes import cause_section, probability
 from greybox.report.diagnosis_figures import (
@@ -168,6 +168,8 @@ def _budget(diagnosis: Diagnosis) -> Iterator[Picture]:
             "Sources of the squared error of the held-out free run, before and after the model is "
             "extended; the part of a cause is how much smaller the error would be without it."
         )
+        if not all(is_split(p, state) for p in diagnosis.budget for state in p.share):
+            caption += " Shares that the logs cannot split are not drawn."
         if cut_off(diagnosis.budget):
             caption += " Shares beyond the picture's edge stand in the table of the budget."
         caption += f" {told}" if (told := hardly_split(diagnosis.budget)) else ""

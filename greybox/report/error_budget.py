@@ -21,18 +21,19 @@ _SHOWN = (-60.0, 140.0)
 
 
 def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
-    """Draw the share of each part in each state with its interval, and what is left of it after."""
+    """Draw the shares that the logs tell with their intervals, and what is left of them after."""
     states = list(budget[0].share)
     figure = new_figure(_WIDTH, 1.0 + 0.3 * len(budget))
     axes = figure.subplots(1, len(states), sharey=True, squeeze=False)[0]
     places = np.arange(len(budget))
     for ax, state in zip(axes, states, strict=True):
-        share = 100 * np.array([p.share[state] for p in budget])
-        low, high = 100 * np.array([p.ci[state] for p in budget]).T
+        told = [100.0 if is_split(p, state) else np.nan for p in budget]
+        share = told * np.array([p.share[state] for p in budget])
+        low, high = told * np.array([p.ci[state] for p in budget]).T
         ax.barh(places, share, 0.72, color=BLUE, edgecolor="0.2", linewidth=0.6, label="before")
         ax.barh(
-            places, [100 * p.after[state] for p in budget], 0.3, color=ORANGE, edgecolor="0.2",
-            linewidth=0.6, label="after the extension",
+            places, told * np.array([p.after[state] for p in budget]), 0.3, color=ORANGE,
+            edgecolor="0.2", linewidth=0.6, label="after the extension",
         )  # fmt: skip
         ax.hlines(places, low, high, color="0.2", linewidth=1.0, label="95 % interval of before")
         ax.axvline(0, color="0.2", linewidth=0.8)

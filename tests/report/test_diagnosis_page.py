@@ -29,7 +29,7 @@ from greybox.notebook import with_error
 from greybox.report.diagnosed_causes import probability
 from greybox.report.diagnosis import diagnosis_page
 from greybox.report.diagnosis_figures import command_figure, most_followed
-from greybox.report.error_budget import budget_table, largest
+from greybox.report.error_budget import budget_figure, budget_table, largest
 from greybox.report.error_profiles import block_ids, memory, profile
 from greybox.report.free_run_errors import gather
 from greybox.report.model_difference import (
@@ -286,6 +286,12 @@ def test_a_share_that_may_be_any_is_not_told():
     assert line.split("  ")[-1].strip() == "cannot be split"
     assert "70.0 (-90.0 to 100.0)" in line
     assert budget_table(budget).rows[1][-1] == "cannot be split"
+    widths = [[b.get_width() for b in ax.patches] for ax in budget_figure(budget).axes]
+    assert np.isnan(widths[2][1])
+    assert np.isfinite(widths[1]).all()
+    unsaid = "Shares that the logs cannot split are not drawn."
+    assert unsaid in diagnosis_page(named, RECORD).lead.caption
+    assert unsaid not in diagnosis_page(diagnosis_of("named"), RECORD).lead.caption
     assert named.to_dict()["budget"][1]["ci"]["r"] == [-1.6, 1.8]
     assert "current" in largest(BUDGET).split("; ")[-1]
     assert "current" not in largest(budget).split("; ")[-1]
@@ -365,6 +371,16 @@ def test_the_command_that_errors_follow_is_shown(told):
     assert len(command_figure(two, "n").axes[0].get_lines()[0].get_xdata()) == 2
     assert most_followed(replace(errors, commands={})) is None
     assert "by the command that it goes with most" in told["named"]
+
+
+def test_a_step_without_a_named_cause_says_so():
+    named = diagnosis_of("named")
+    told = [p.caption for p in diagnosis_page(named, RECORD).sections[1].pictures]
+    assert "Bold: the causes that the verdict names." in told[0]
+    other = replace(named, steps=(tuple(r for r in named.steps[0] if r.key[0] == "t"),))
+    (told,) = (p.caption for p in diagnosis_page(other, RECORD).sections[1].pictures)
+    assert "The verdict names none of these." in told
+    assert "Bold" not in told
 
 
 def test_only_what_the_verdict_names_is_bold(pages):
