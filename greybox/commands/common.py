@@ -26,8 +26,8 @@ __all__ = [
     "progress", "provenance", "publish", "read_logs", "say", "show_next",
 ]  # fmt: skip
 
-# endings of what is no model
-_NO_MODELS = (".csv", ".parquet", ".pq", ".toml", ".html")
+# endings that name a format
+_ENDINGS = (".csv", ".parquet", ".pq", ".json", ".toml", ".html")
 # GiB that logs and what is made of them may take by default, those of a usual machine
 _MEMORY = 4.0
 VESSEL_HELP = "vessel file (TOML), as 'greybox import --help' shows one, or thesis or ferry"
@@ -199,19 +199,20 @@ def read_logs(
     return logs, (*misnamed, *told, *left_out)
 
 
-def require_model_name(path: str | None) -> None:
-    """Raise where a model would be written under the ending of another file.
+def require_ending(path: str | None, ending: str, what: str) -> None:
+    """Raise where what --out writes would have the ending of another format.
 
     Raises
     ------
     UsageError
-        Commands that look for logs or vessel files would take it for one.
+        Commands that read files by their endings would take it for another.
     """
     from greybox.errors import UsageError
 
-    if path is not None and Path(path).suffix.casefold() in _NO_MODELS:
+    if path is not None and Path(path).suffix.casefold() in {*_ENDINGS} - {ending}:
         raise UsageError(
-            f"--out names '{path}', and a model is JSON: name a file that ends in .json."
+            f"--out names '{path}', and {what} is {ending[1:].upper()}: name a file that ends in "
+            f"{ending}."
         )
 
 

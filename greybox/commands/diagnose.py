@@ -15,7 +15,7 @@ from greybox.commands.common import (
     provenance,
     publish,
     read_logs,
-    require_model_name,
+    require_ending,
 )
 from greybox.numerics.threads import one_thread
 
@@ -110,7 +110,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.vessel.force import force_inputs
     from greybox.vessel.toml import load_vessel
 
-    require_model_name(options.out)
+    require_ending(options.out, ".json", "a model")
     check_targets(options.out, options.json, options.report)
     keep_freed_memory()
     vessel = load_vessel(options.vessel)

@@ -19,7 +19,7 @@ from greybox.commands.common import (
     provenance,
     publish,
     read_logs,
-    require_model_name,
+    require_ending,
 )
 from greybox.estimation.registry import ESTIMATORS
 from greybox.model.predictor_kinds import PREDICTORS
@@ -364,7 +364,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.vessel.toml import load_vessel
 
     _require_heeded(options)
-    require_model_name(options.out)
+    require_ending(options.out, ".json", "a model")
     check_targets(options.out, options.json, options.report)
     vessel = load_vessel(options.vessel)
     # the vessel's own terms may be changed too: here only the states matter

@@ -12,6 +12,7 @@ from greybox.commands.common import (
     progress,
     provenance,
     publish,
+    require_ending,
 )
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.fleet.ships import fleet_files
     from greybox.report.next_steps import after_fleet
 
+    require_ending(options.out, ".csv", "the table")
     check_targets(options.out, options.json, options.report)
     _require_outside(options)
     fleet = estimate_fleet(options.fleet, seed=options.seed, progress=progress("ships"))

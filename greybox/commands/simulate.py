@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Literal
 
-from greybox.commands.common import add_seed, say
+from greybox.commands.common import add_seed, require_ending, say
 
 HELP = "run a model freely on the inputs of a log"
 EXAMPLES = """examples:
@@ -54,6 +54,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.validation.bands import predict_bands
     from greybox.validation.fit import run_model
 
+    require_ending(options.out, ".csv", "a run")
     check_targets(options.out)
     model = load_model(options.model)
     fill: dict[str, float] = {}

@@ -367,3 +367,14 @@ def test_a_model_is_not_written_under_the_ending_of_a_log(command, tmp_path, cap
     assert run(command, "none.csv", "--vessel", "thesis", "--out", out) == 1
     assert "a model is JSON: name a file that ends in .json" in capsys.readouterr().err
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "what"),
+    [(("simulate", "m.json", "trial.csv"), "a run"), (("fleet", "."), "the table")],
+)
+def test_text_is_not_written_under_the_ending_of_another_format(given, what, tmp_path, capsys):
+    out = tmp_path / "run.parquet"
+    assert run(*given, "--out", out) == 1
+    assert f"{what} is CSV: name a file that ends in .csv" in capsys.readouterr().err
+    assert not out.exists()

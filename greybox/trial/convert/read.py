@@ -399,10 +399,11 @@ def _require(
             )
     for state in states:
         if state not in channels:
-            need = "psi and x_n, y_n" if state in "uv" else "psi"
+            need = {"u": "psi and x_n, y_n", "v": "psi and x_n, y_n", "r": "psi"}.get(state)
+            underived = f" and it cannot be derived without {need}" if need else ""
             still = not channels.keys() & set(MOTION_SIGNALS)
             raise LogError(
-                f"'{name}' has no '{state}' and it cannot be derived without {need}."
+                f"'{name}' has no '{state}'{underived}."
                 f"{suggestion(state, free)} Map the columns in the vessel file's [columns]"
                 + ("; commands alone are simulated with --start." if still else ".")
             )
