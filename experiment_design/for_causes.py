@@ -375,7 +375,7 @@ def design_for_causes(
     require_horizon(request)
     causes, tried, notes = open_causes(request, model, asked)
     found, _ = operating_envelope(request, model, envelope or {})
-    request = replace(started_in(request, found, int(kept_start)), misfit=found.misled)
+    request = started_in(replace(request, misfit=found.misled), found, int(kept_start))
     problem = build_problem(request)
     rollout, schedule = problem.scenarios[0].rollout, problem.schedule
     usual = rollout.run(

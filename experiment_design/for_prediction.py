@@ -18,6 +18,7 @@ from experiment_design.excitation.rollout import Motion
 from experiment_design.feasibility.checks import require_horizon, smallest_circle
 from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
+    keeps_start,
     tighten,
 )
 from experiment_design.feasibility.least_violation import least_change
@@ -350,7 +351,7 @@ def design_for_prediction(
     require_horizon(request)
     found, level = operating_envelope(request, model, envelope or {})
     states = request.structure.states
-    asked = replace(started_in(request, found, kept_starts), misfit=found.misled)
+    asked = started_in(replace(request, misfit=found.misled), found, kept_starts)
     if kept_starts:
         asked = after_lead_in(asked, best_effort=best_effort)
     before = log_moments(found, sailed)
@@ -399,23 +400,27 @@ def design_for_prediction(
 def started_in(request: PreparedRequest, envelope: Envelope, kept: int) -> PreparedRequest:
     """Return the request whose trials but the first few start on a course in the envelope.
 
-    It is the fastest that the caps allow; where they allow none, trials start as they were
-    prepared.
+    It is the fastest that keeps the caps with the wanted probability, or else by the prior alone;
+    where none does, trials start as they were prepared.
     """
     others = request.trials - kept
     if not others:
         return request
     problem = build_problem(request, request.trials - 1)
+    given = request.start_commands or (None,) * request.trials
+    fastest = None
     for start, commands in _courses(envelope):
         if (problem.missed_at_start(start) > TOLERANCE).any():
             continue
-        given = request.start_commands or (None,) * request.trials
-        return replace(
+        begun = replace(
             request,
             starts=(*request.starts[:kept], *(start,) * others),
             start_commands=(*given[:kept], *(commands,) * others),
         )
-    return request
+        if keeps_start(begun, request.trials - 1):
+            return begun
+        fastest = fastest or begun
+    return fastest or request
 
 
 def _courses(envelope: Envelope) -> Iterator[tuple[Array, Array]]:

@@ -120,17 +120,22 @@ class Rollout:
         """Run freely on commands (R, N, nc), with the vessel's lag and delay where `late`."""
         return self._run(self.theta, commands, late)
 
-    def run_models(self, thetas: Array, commands: Array, *, late: bool = False) -> Motion:
-        """Run other parameters (R, p) on the same commands (N, nc), or each on its own."""
-        together = np.broadcast_to(commands, (len(thetas), *commands.shape[-2:]))
-        return self._run(thetas, together, late)
+    def run_models(
+        self, thetas: Array, commands: Array, *, late: bool = False, begun: Array | None = None
+    ) -> Motion:
+        """Run other parameters (R, p) on the same commands (N, nc), or each on its own.
 
-    def _run(self, theta: Array, commands: Array, late: bool) -> Motion:
+        From the same initial states, or each from its own, `begun` (R, nx).
+        """
+        together = np.broadcast_to(commands, (len(thetas), *commands.shape[-2:]))
+        return self._run(thetas, together, late, begun)
+
+    def _run(self, theta: Array, commands: Array, late: bool, begun: Array | None = None) -> Motion:
         structure, tau = self.structure, self.forces(commands, late=late)
         samples = commands.shape[1]
         heading = None if "r" in structure.states else np.full(samples + 1, self.start[-1])
         free = simulate(
-            structure, theta, self.start[:-1], tau, self.sample_time,
+            structure, theta, self.start[:-1] if begun is None else begun, tau, self.sample_time,
             psi=heading, psi0=float(self.start[-1]),
             d=np.broadcast_to(self.d, (samples, self.d.size)) if self.d.any() else None,
             integrator=self.integrator,

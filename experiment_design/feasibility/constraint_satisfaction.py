@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from experiment_design.constraints.kinds.margin import Margin
 from experiment_design.constraints.limits import TOLERANCE
+from experiment_design.excitation.rollout import Motion, Rollout
 from experiment_design.optimise.campaign import search_campaign
 from experiment_design.optimise.search import Candidate, assess
 from experiment_design.request.problem import TrialProblem
+from experiment_design.request.regimes import STEADY_SECONDS
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.numerics.binomial import wilson_interval
 
@@ -75,7 +77,8 @@ def keep_probability(
 ) -> ConstraintSatisfaction:
     """Run the plan under models drawn from the prior and count which keep every limit.
 
-    A lead-in is run too; margins count after it.
+    Each begins in the motion that the commands at the start hold it in. A lead-in is run too;
+    margins count after it.
 
     Parameters
     ----------
@@ -95,15 +98,10 @@ def keep_probability(
     thetas = request.draw_models(draws, 1)
     plain = replace(request, backoff=())
     for t, c in enumerate(commands):
-        nominal = plain.rollout(plain.starts[t])
-        program = plain.limit_program(nominal, t)
-        motion = nominal.run_models(thetas, c, late=True)
-        if plain.misfit is not None:
-            motion = nominal.moved(motion, plain.misfit(nominal.run(c[None]), draws))
-        over = program.worst(motion.state, since)
-        over[:, ~motion.stable] = np.inf
-        kept &= (over <= 1e-3).all(axis=0) & motion.stable
+        over, keep = _missed(plain, t, thetas, c, since)
+        kept &= keep
         missed.append(over)
+    program = plain.limit_program(plain.rollout(plain.starts[0]), 0)
     worst = np.max(missed, axis=0)
     quantile = min(0.995, request.probability + 0.5 * (1 - request.probability))
     # no limit that is tightened helps models that all run away
@@ -120,6 +118,55 @@ def keep_probability(
     )  # fmt: skip
 
 
+def keeps_start(request: PreparedRequest, trial: int, draws: int = _DRAWS) -> bool:
+    """Return whether a trial begins within its path limits with the wanted probability."""
+    held = request.start_commands[trial] if request.start_commands else None
+    if held is None or not request.uncertain:
+        return True
+    plain, thetas = replace(request, backoff=()), request.draw_models(draws, 1)
+    return bool(_missed(plain, trial, thetas, held[None])[1].mean() >= request.probability)
+
+
+def _missed(
+    request: PreparedRequest, trial: int, thetas: Array, commands: Array, since: int = 0
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return by how much models (R, p) miss each path limit at worst (m, R), and which keep all.
+
+    It is inf where a model is unstable.
+    """
+    nominal = request.rollout(request.starts[trial])
+    held = request.start_commands[trial] if request.start_commands else None
+    begun, settled = None, np.ones(len(thetas), bool)
+    # in a current no motion is steady on all headings
+    if held is not None and not request.d.any():
+        samples = round(STEADY_SECONDS / request.sample_time)
+        steady = _drawn(request, nominal, thetas, np.repeat(held[None], samples, axis=0))
+        begun, settled = steady.state[:, -1, : nominal.nx], steady.stable
+    motion = _drawn(request, nominal, thetas, commands, begun)
+    over = request.limit_program(nominal, trial).worst(motion.state, since)
+    stable = motion.stable & settled
+    over[:, ~stable] = np.inf
+    return over, (over <= 1e-3).all(axis=0) & stable
+
+
+def _drawn(
+    request: PreparedRequest,
+    nominal: Rollout,
+    thetas: Array,
+    commands: Array,
+    begun: Array | None = None,
+) -> Motion:
+    """Run models (R, p), with forces drawn from the prior's misfit, from their own states or one.
+
+    What the forces do adds up from nothing, and what is left of the states' own difference dies
+    out, so that both together stay what a model settled to.
+    """
+    motion = nominal.run_models(thetas, commands, late=True, begun=begun)
+    if request.misfit is None:
+        return motion
+    return nominal.moved(motion, request.misfit(nominal.run(commands[None]), len(thetas)))
+
+
 def tighten(
     request: PreparedRequest,
     first: Found,
@@ -129,7 +176,7 @@ def tighten(
 ) -> tuple[PreparedRequest, Found, ConstraintSatisfaction]:
     """Search again with tighter path limits until they are kept with the wanted probability.
 
-    What is found then keeps all limits as they were asked for, or ends it.
+    Where what is found misses limits as they were asked for, they are tightened half as much.
 
     Parameters
     ----------
@@ -138,7 +185,7 @@ def tighten(
     first : object
         What was found with them.
     again : callable
-        Searches with tighter limits, given what was found last; None ends it.
+        Searches with tighter limits, given what was found last; None where nothing was.
     units : callable
         Unit coordinates of what was found, one a trial.
     rounds : int
@@ -151,21 +198,21 @@ def tighten(
     problems = [build_problem(request, t) for t in range(request.trials)]
     keeping = keep_probability(request, units(first))
     best = (request, first, keeping)
-    last, shortfall = first, keeping.shortfall
-    backoff = np.zeros(len(shortfall))
+    last, more = first, 1.1 * keeping.shortfall
+    backoff = np.zeros(len(more))
     for _ in range(rounds):
-        if best[2].probability >= request.probability or not shortfall.any():
+        if best[2].probability >= request.probability or not more.any():
             break
-        backoff = backoff + 1.1 * shortfall
-        tighter = replace(request, backoff=tuple(backoff))
+        tighter = replace(request, backoff=tuple(backoff + more))
         found = again(tighter, last)
         if found is None or any(
             (assess(p, u[None])[0].missed > TOLERANCE).any()
             for p, u in zip(problems, units(found), strict=True)
         ):
-            break
+            more = 0.5 * more
+            continue
         now = keep_probability(request, units(found))
-        last, shortfall = found, now.shortfall
+        last, backoff, more = found, backoff + more, 1.1 * now.shortfall
         if now.probability > best[2].probability:
             best = (tighter, found, now)
     return best

@@ -14,7 +14,11 @@ from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import LIMITS, Circle, Circumstances, TrialLimits
 from experiment_design.excitation.schedule import make_schedule
 from experiment_design.feasibility.checks import feasible_or_reason
-from experiment_design.feasibility.constraint_satisfaction import keep_probability, tighten
+from experiment_design.feasibility.constraint_satisfaction import (
+    keep_probability,
+    keeps_start,
+    tighten,
+)
 from experiment_design.feasibility.least_violation import moved_constant
 from experiment_design.optimise.search import assess
 from experiment_design.request.request import build_problem
@@ -242,6 +246,49 @@ def test_models_that_all_run_away_keep_no_limit():
     assert found.probability == 0.0
     assert not found.shortfall.any()
     assert found.margins["u"] == -np.inf
+
+
+def test_models_begin_where_the_commands_at_the_start_hold_them():
+    """A trial that slows down passes its cap at the start, under models that are faster."""
+    held = np.array([15.0, 0.6, 0.6])
+    request = make_request(duration=60.0, limits=TrialLimits(), regimes=((),))
+    ends = request.rollout(request.starts[0]).run(np.repeat(held[None, None], 400, axis=1))
+    start = np.append(ends.state[0, -1, :3], 0.0)
+    spread = np.zeros(len(request.theta))
+    spread[request.structure.index("Xmu")] = 0.2 * request.theta[request.structure.index("Xmu")]
+    asked = replace(
+        request, starts=(start,), start_commands=(held,), covariance=np.diag(spread**2),
+        limits=TrialLimits(speed_cap=1.002 * float(np.hypot(*start[:2]))),
+    )  # fmt: skip
+    slow = [np.zeros(build_problem(asked).shape)]
+    known = replace(asked, start_commands=())
+    assert keep_probability(known, slow).probability > 0.99
+    assert keep_probability(asked, slow).probability < asked.probability
+    assert keeps_start(known, 0)
+    assert not keeps_start(asked, 0)
+
+
+def test_limits_that_cannot_be_tightened_as_much_are_tightened_half_as_much():
+    request = make_request(duration=60.0, regimes=((),))
+    request = replace(request, covariance=np.diag((0.1 * request.theta) ** 2))
+    problem = build_problem(request)
+    drawn = np.random.default_rng(0).random((60, *problem.shape))
+    state = problem.scenarios[0].rollout.run(problem.commands(drawn)).state
+    speed = np.hypot(state[:, 1:, 0], state[:, 1:, 1]).max(axis=1)
+    slow, fast = int(speed.argmin()), int(speed.argmax())
+    middle = int(np.argsort(speed)[len(speed) // 2])
+    asked = replace(request, limits=TrialLimits(speed_cap=1.001 * float(speed[middle])))
+    tried = []
+
+    def again(tighter, _):
+        tried.append(tighter.backoff)
+        # too tight for any but a sequence that breaks the cap as it was asked for
+        return fast if len(tried) == 1 else slow
+
+    tighter, chosen, keeping = tighten(asked, middle, again, lambda which: [drawn[which]], 2)
+    assert tried[1] == tighter.backoff == pytest.approx(0.5 * np.array(tried[0]))
+    assert chosen == slow
+    assert keeping.probability > keep_probability(asked, [drawn[middle]]).probability
 
 
 def test_tightening_gives_up_no_limit_that_was_asked_for():
