@@ -74,13 +74,17 @@ def _show(text: str, done: int = 0, total: int | None = None) -> None:
     if not _shown:
         from rich import progress as rich
         from rich.console import Console
+        from rich.table import Column
 
-        what = rich.TextColumn("{task.description}", markup=False)
+        console = Console(stderr=True)
+        # what is said may be long: the time beside it stays on the line
+        room = Column(no_wrap=True, max_width=max(console.width - 12, 1))
+        what = rich.TextColumn("{task.description}", markup=False, table_column=room)
         left = (rich.BarColumn(), rich.TimeRemainingColumn(), "left")
         # steps may take minutes, so the time left is told by all of them
         bar = rich.Progress(
             rich.SpinnerColumn(), what, *(left if total else [rich.TimeElapsedColumn()]),
-            console=Console(stderr=True), transient=True, speed_estimate_period=float("inf"),
+            console=console, transient=True, speed_estimate_period=float("inf"),
             redirect_stdout=False, redirect_stderr=False,
         )  # fmt: skip
         bar.add_task("", total=total)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -51,6 +52,7 @@ _ALONE: dict[str, Callable[[Finding], Figure]] = {
     "quantised": coarse_figure, "actuator": actuator_figure, "external_force": force_figure,
     "limit": range_figure, "air": wind_figure, "push": answer_figure, "drift": course_figure,
 }  # fmt: skip
+_log = logging.getLogger(__name__)
 # what makes a force model wrong before what it only has to do without
 _SERIOUS = (
     "frame", "sign", "unit", "clock_offset", "heading_bias", "lever_arm", "time_format",
@@ -253,6 +255,7 @@ def _section(
     ``shown`` names the log in which each finding is drawn. One that several logs share is
     drawn again only where its repair does not help.
     """
+    _log.info("pictures of %s", report.name)
     pictures: list[Picture] = []
     sentences: list[str] = []
     if not report.findings:

@@ -75,6 +75,18 @@ with telling(0, False):
     assert "a part of a step" not in shown
 
 
+def test_the_time_stays_beside_long_words():
+    script = """
+import logging
+from greybox.commands.terminal import telling
+with telling(0, False):
+    logging.getLogger("greybox.any").info("word " * 50)
+"""
+    _, shown = on_a_terminal("-c", script, COLUMNS="60", NO_COLOR="1")
+    lines = re.sub(r"\x1b\[[?0-9;]*[A-Za-z]", "", shown).split("\r")
+    assert any("word word" in line and line.rstrip().endswith("0:00:00") for line in lines)
+
+
 def test_an_error_takes_the_place_of_progress():
     """A command that fails half way leaves its one sentence alone on the line."""
     script = SCRIPT.replace("range(1, 4)", "range(1, 3)") + (

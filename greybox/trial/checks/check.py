@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -40,6 +41,8 @@ from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.raw_log import Recording
 from greybox.trial.repair import apply_repairs
 from greybox.vessel.vessel import Vessel
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -167,10 +170,15 @@ def check_recordings(
                 f"count as 2 logs: name one of them."
             )
         known[content] = name
-    logs = [_signal_quality(recording, vessel) for recording in recordings]
+    logs = []
+    for recording in recordings:
+        _log.info("samples of %s", recording.name)
+        logs.append(_signal_quality(recording, vessel))
+    _log.info("axes, signs, units, clocks, antenna and heading of %d log(s) together", len(logs))
     _kinematics(logs, vessel)
     actuators: tuple[ActuatorEstimate, ...] = ()
     if forces:
+        _log.info("wind, thrusters and actuators")
         _forces(logs, vessel)
         actuators = _actuators(logs, vessel)
     return [
