@@ -245,7 +245,8 @@ def unexcited(problems: list[TrialProblem], units: list[Array], request: Prepare
             still = predictor.columns[mine[int(size.argmin())]].label
             return (
                 f"no sequence within these limits moves {still}: its regressor varies by 0. "
-                f"Widen the limits, or leave it out of the structure."
+                f"Widen the limits, leave it out of the structure, or use --estimator oe, which "
+                f"needs no variation to tell a constant force."
             )
         values, vectors = np.linalg.eigh(scaled(gram)[0])
         if values[0] < worst:

@@ -13,16 +13,18 @@ from experiment_design.command import add_arguments
 from experiment_design.constraints.limit_program import LimitProgram
 from experiment_design.constraints.limits import LIMITS, Circle, Circumstances, TrialLimits
 from experiment_design.excitation.schedule import make_schedule
-from experiment_design.feasibility.checks import feasible_or_reason
+from experiment_design.feasibility.checks import feasible_or_reason, unexcited
 from experiment_design.feasibility.constraint_satisfaction import (
     keep_probability,
     keeps_start,
     tighten,
 )
 from experiment_design.feasibility.least_violation import moved_constant
+from experiment_design.optimise.campaign import covariance_of
 from experiment_design.optimise.search import assess
 from experiment_design.request.request import build_problem
 from greybox.errors import UsageError, VesselError
+from greybox.model.catalogue import get_structure
 from greybox.vessel.toml import load_vessel
 from greybox.vessel.vessel import Limits
 
@@ -232,6 +234,21 @@ def test_where_only_what_tells_nothing_keeps_the_limits_the_limit_is_named():
     assert "regressor" in reason
     lively = replace(silent, value=1.0)
     assert feasible_or_reason(problem, request, 0, telling, lively) == (lively, "")
+
+
+def test_a_constant_force_is_sent_to_output_error():
+    """Instrumental variables take the means out, so nothing of it is left; sensitivities stay."""
+    request, structure = make_request(), get_structure("thesis+X_0")
+    known = dict(zip(request.structure.parameters, request.theta, strict=True))
+    theta = np.array([known.get(n, 1e-3) for n in structure.parameters])
+    request = replace(request, structure=structure, theta=theta)
+    problem = build_problem(request)
+    unit = np.random.default_rng(0).random(problem.shape)
+    said = unexcited([problem], [unit], request)
+    assert said.startswith("no sequence within these limits moves X_0: its regressor varies by 0.")
+    assert "--estimator oe" in said
+    free = build_problem(replace(request, estimator="oe"))
+    assert np.isfinite(covariance_of([free], [unit])).all()
 
 
 def test_models_that_all_run_away_keep_no_limit():
