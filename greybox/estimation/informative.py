@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +115,14 @@ def is_noise(logs: Sequence[TrialLog], name: str, share: float) -> bool:
     return share < _STEADY and size < _WHITE * (white_noise(values) or 0.0)
 
 
+def cancelled(structure: Structure, share: Mapping[str, float]) -> tuple[list[str], list[str]]:
+    """Return the inputs whose thrusts cancel but for rounding, and the terms that have them."""
+    # a rudder amidships, or a propeller at rest, is named by the equations
+    still = [s for s in structure.inputs if share.get(s, 1.0) < _ROUNDING]
+    still = [s for s in still if share[s] > 0 or s in ("taux", "tauy", "taun")]
+    return still, [t.name for t in structure.terms if any(f.signal in still for f in t.factors)]
+
+
 def require_informative(
     logs: Sequence[TrialLog], predictor: PredictorKind, structure: Structure
 ) -> None:
@@ -131,10 +139,7 @@ def require_informative(
     require_motion(logs, structure)
     if structure.marine:
         share = movements(logs, structure)
-        # a rudder amidships, or a propeller at rest, is named by the equations
-        still = [s for s in structure.inputs if share.get(s, 1.0) < _ROUNDING]
-        still = [s for s in still if share[s] > 0 or s in ("taux", "tauy", "taun")]
-        lost = [t.name for t in structure.terms if any(f.signal in still for f in t.factors)]
+        still, lost = cancelled(structure, share)
         if lost:
             raise ExcitationError(
                 unexcited(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import DivergenceError, GreyboxError, LogError, OutOfTimeError
-from greybox.estimation.informative import ADVISED_HEADING, heading_range
+from greybox.estimation.informative import ADVISED_HEADING, cancelled, heading_range, movements
 from greybox.estimation.registry import ESTIMATORS, automatic_estimators
 from greybox.estimation.tried import Comparison, TriedModel
 from greybox.model.catalogue import structure_for
@@ -127,10 +127,18 @@ def structures_to_try(logs: Sequence[TrialLog], wind: bool) -> list[str]:
     force, which the bias-capturing terms cannot be told from.
     """
     if wind:
-        return ["thesis", "linear+Wuu+Wvv+Wuv"]
-    if heading_range(logs) < ADVISED_HEADING:
-        return ["thesis", "linear", "linear+X_0+Y_0+N_0"]
-    return ["thesis", "linear"]
+        names = ["thesis", "linear+Wuu+Wvv+Wuv"]
+    elif heading_range(logs) < ADVISED_HEADING:
+        names = ["thesis", "linear", "linear+X_0+Y_0+N_0"]
+    else:
+        names = ["thesis", "linear"]
+    vessel = logs[0].vessel
+    if any(t.type != "propeller_rudder" for t in vessel.thrusters):
+        return names
+    # propellers to both sides that turned alike have no moment, and rudders steer without one
+    thesis = structure_for(names[0], force_inputs(vessel))
+    still, lost = cancelled(thesis, movements(logs, thesis))
+    return [n + "".join(f"-{t}" for t in lost) for n in names] if still == ["taun"] else names
 
 
 def _plausible(

@@ -11,8 +11,11 @@ from virtual import PARAMETERS, virtual_log, write_csv
 
 from greybox.commands.main import main
 from greybox.errors import ExcitationError, UsageError
+from greybox.estimation.informative import require_informative
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.predictor import build_predictor
+from greybox.model.predictor_kinds import PREDICTORS
+from greybox.selection.alternatives import structures_to_try
 from greybox.selection.estimate import estimate_requested
 from greybox.selection.fit_single import estimate_once
 from greybox.selection.held_out import folds, rank, score_runs, spread_of
@@ -26,10 +29,11 @@ from greybox.selection.reduction import (
 from greybox.selection.request import Request
 from greybox.selection.structures import CandidateFit, compare_structures
 from greybox.study.chapter7 import REDUCED_BIASES
-from greybox.trial.log import TrialLog
+from greybox.trial.log import TrialLog, make_log
 from greybox.validation.criteria import independent_samples, information_criteria
 from greybox.validation.fit import run_model
 from greybox.vessel.force import force_inputs
+from greybox.vessel.toml import vessel_from_dict
 
 ABSENT = ("Xkappa", "Yvr", "Nvv", "Wvv", "Wuv")
 STRONG = {"Xvr", "Xmu", "Yur", "Ymu", "Nr", "Nmu"}
@@ -276,3 +280,27 @@ def test_what_was_refused_together_is_not_tried_together_again():
     assert together[0].note == "kept: held-out runs miss it"
     # its columns were tried one by one after it
     assert any(len(t.dropped) == 1 for t in tried)
+
+
+def test_propellers_to_both_sides_that_turn_alike_have_no_moment_to_estimate():
+    rows = [
+        {"type": "propeller_rudder", "x": -10.0, "y": y, "speed": "n", "rudder": "delta"}
+        for y in (-1.8, 1.8)
+    ]
+    vessel = vessel_from_dict({"name": "Twin", "length": 30.0, "thruster": rows})
+    single = vessel_from_dict({"name": "One", "length": 30.0, "thruster": rows[:1]})
+    rng = np.random.default_rng(0)
+    hold = np.repeat(rng.uniform(-0.5, 0.5, 60), 10)
+    channels = {n: 1.0 + 0.1 * rng.standard_normal(600) for n in ("u", "v", "r", "psi")}
+    channels["psi"] = np.linspace(0, 20, 600)
+    channels |= {"n": np.repeat(rng.uniform(3, 6, 60), 10), "delta": hold}
+    log = make_log(vessel, channels, 1.0)
+    names = structures_to_try([log], wind=False)
+    assert [name.partition("-")[0] for name in names] == ["thesis", "linear"]
+    for name in names:
+        left = structure_for(name, force_inputs(vessel))
+        assert not any(f.signal == "taun" for t in left.terms for f in t.factors)
+        require_informative([log], PREDICTORS["basic"], left)
+    # alone, or apart in speed, they have one
+    apart = make_log(single, channels, 1.0)
+    assert structures_to_try([apart], wind=False) == ["thesis", "linear"]

@@ -332,3 +332,23 @@ def test_the_keys_survive_a_round_trip():
 def test_bad_keys(sensors, message):
     with pytest.raises(VesselError, match=message):
         ship(**sensors)
+
+
+@pytest.mark.parametrize("blocks", [False, True])
+def test_a_clock_of_velocities_that_are_made_on_reading(blocks, tmp_path, monkeypatch, limited):
+    columns, _, _ = recorded(arm=(3.0, -1.0))
+    north, east = columns.pop("x_n"), columns.pop("y_n")
+    made = columns | {"v_n": np.gradient(north, STEP), "v_e": np.gradient(east, STEP)}
+    pd.DataFrame({"t": np.arange(600) * STEP} | made).to_csv(tmp_path / "raw.csv", index=False)
+    vessel = ship(clock={"u": 0.53, "v": 0.53, "r": -0.2})
+    if blocks:
+        monkeypatch.setattr("greybox.trial.convert.two_pass_import._LARGE_CELLS", 0)
+        monkeypatch.setattr("greybox.trial.convert.two_pass_import._BLOCK_ROWS", 50)
+        limited(block_bytes=1 << 12)
+    import_files([tmp_path / "raw.csv"], vessel, tmp_path / "log.csv")
+    expected = correct_log(read_log(tmp_path / "raw.csv", ship()), vessel)
+    for log in (read_log(tmp_path / "raw.csv", vessel), read_log(tmp_path / "log.csv", vessel)):
+        assert log.t[0] == pytest.approx(expected.t[0])
+        assert len(log) == len(expected)
+        for name in ("u", "v", "r", "psi"):
+            np.testing.assert_allclose(log[name], expected[name], atol=1e-9)

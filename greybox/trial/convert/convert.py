@@ -285,6 +285,19 @@ def cut_segments(
             Provenance(plan.name), missing,
         )  # fmt: skip
         log = log.window(1, len(log) - 1, plan.name) if made.trim else log
+        # a clock of what was made only now
+        more = correct_channels(
+            log.channels, plan.sample_time, vessel, (*conversion.before, *steps)
+        )
+        if more.steps:
+            first, last = more.before, len(log) - more.after
+            if last - first < plan.least:
+                late = True
+                continue
+            steps = (*steps, *more.steps)
+            missing = carried_gaps(log.missing, more.steps, plan.sample_time)
+            log = replace(log, channels=more.channels, missing=missing)
+            log = log.window(first, last, plan.name)
         log = _between_known(log)
         if len(log) >= MIN_SEGMENT:
             segments.append(log)
