@@ -450,5 +450,7 @@ def _limit_reports(
             worst = way.worst(whole.state, request.lead_in_samples)[:, 0]
             missed[: len(worst)] = np.maximum(missed[: len(worst)], worst)
         for limit, m in zip(program.all_limits, missed, strict=True):
-            found.append(LimitReport(t, limit.words, limit.bound, limit.unit, float(m)))
+            found.append(
+                LimitReport(t, limit.words, limit.bound, limit.unit, float(m), limit.phrase)
+            )
     return tuple(found)

@@ -283,7 +283,8 @@ def limits_of(limits: TrialLimits, trial: LimitedTrial) -> tuple[Limit, ...]:
 class LimitReport:
     """One limit and how the plan stands to it.
 
-    ``missed`` is 0 where it is kept, else by how much it is not, in `unit`.
+    ``missed`` is 0 where it is kept, else by how much it is not, in `unit`; ``phrase`` is the
+    limit in words, with its bound.
     """
 
     trial: int
@@ -291,3 +292,4 @@ class LimitReport:
     bound: float
     unit: str
     missed: float
+    phrase: str = ""

@@ -288,10 +288,8 @@ class Design(DisplayMixin):
 
     def missed(self) -> list[str]:
         """Return which limits are not kept, each with its bound and by how much."""
-        bounds = [f"{x.name} of {x.bound:g} {x.unit}".rstrip() for x in self.broken]
         return [
-            f"the {told} is missed by {x.missed:.3g} {x.unit}".rstrip()
-            for told, x in zip(bounds, self.broken, strict=True)
+            f"the {x.phrase} is missed by {x.missed:.3g} {x.unit}".rstrip() for x in self.broken
         ]
 
     def summary(self) -> str:

@@ -471,6 +471,7 @@ def test_the_closest_plan_where_no_other_is_found(model) -> None:
     assert design.status == CLOSEST
     assert str(told.value) in design.notes
     assert [x.name for x in design.broken] == ["sea room"]
+    assert design.missed()[0].startswith("the sea room is missed by ")
 
 
 def test_the_closest_plan_to_a_margin_out_of_reach(model) -> None:
