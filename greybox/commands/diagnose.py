@@ -178,6 +178,7 @@ def _with_files(steps: Sequence[str], record: Mapping[str, Any]) -> list[str]:
     model = Path(out or "mended.json")
     filled = [
         step.replace("--vessel V", f"--vessel {typed(record, 'vessel', 'V')}")
+        .replace(" LOGS ", f" {typed(record, 'logs', 'LOGS')} ")
         .replace("--model MODEL", f"--model {quote(str(model))}")
         .replace("MODEL.", f"{quote(str(model.with_suffix('')))}.")
         for step in steps

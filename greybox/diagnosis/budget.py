@@ -26,7 +26,7 @@ from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.result import BudgetPart
 from greybox.diagnosis.ship import LogRun, Ship
 from greybox.diagnosis.thresholds import GUST
-from greybox.diagnosis.waves import Waves
+from greybox.diagnosis.waves import Waves, noise_in
 from greybox.trial.log import TrialLog
 
 Array = NDArray[np.float64]
@@ -231,8 +231,8 @@ def error_budget(
         Shares of each state, before and after the causes are mended, both of the squared error
         before, with 95 % intervals by a circular block bootstrap of the samples (Politis and
         Romano, 1992) in which each cause's size varies by its standard error, and what the
-        extended model leaves beyond the sensors' noise goes with the error without the cause, or
-        against it, as may be; empty where a run leaves every bound.
+        extended model leaves beyond the sensors' noise and waves goes with the error without the
+        cause, or against it, as may be; empty where a run leaves every bound.
     """
     if not len(base) or any(p.fit.escaped or p.held_fit.escaped for p in final):
         return ()
@@ -252,7 +252,7 @@ def error_budget(
         left = tuple(
             np.where(taken, e, plain) for e, plain in zip(errors, pair.held_fit.errors, strict=True)
         )
-        noise.append((_noise_of(pair, left), sum(map(len, left))))
+        noise.append((_noise_of(pair, left, waves), sum(map(len, left))))
     left_over = {MOTION: e1**2 - rest**2}
     without = {c.id: c.errors for c in causes if len(c.errors)}
     before = {name: e0**2 - errors**2 for name, errors in without.items()} | left_over
@@ -269,7 +269,9 @@ def error_budget(
     whole, drawn_whole = (e0**2).sum(axis=0), block_sums(e0**2, starts, length)
     # a channel that was measured nowhere has no error
     whole, drawn_whole = np.maximum(whole, 1e-300), np.maximum(drawn_whole, 1e-300)
-    left = np.maximum((e1**2).sum(axis=0) - counts * moments[SENSOR], 0.0)
+    # the sea goes with neither
+    nobodys = moments[SENSOR] + moments[WAVES]
+    left = np.maximum((e1**2).sum(axis=0) - counts * nobodys, 0.0)
     # the ship without the cause is known as well as the extended model follows it
     unsure = {
         name: 2
@@ -332,11 +334,12 @@ def _measured(held: Sequence[Problem]) -> NDArray[np.bool_]:
     return known[:, : len(held[0].structure.states)]
 
 
-def _noise_of(pair: Pair, errors: Sequence[Array]) -> Noise:
+def _noise_of(pair: Pair, errors: Sequence[Array], waves: Waves | None) -> Noise:
     held, fit = pair.held, pair.held_fit
-    return fit_noise(
+    noise = fit_noise(
         errors, held.poles(fit.point), held.sample_time, held.groups, fit.noise, known=held.known
     )
+    return noise_in(waves, replace(fit, noise=noise, errors=tuple(errors)))
 
 
 def _moments(

@@ -128,10 +128,12 @@ class DiagnosisBuilder:
         cause = self.causes[candidate.hypothesis.cause]
         quantities = quantities_of(self.case.problem(fit.integrator), candidate, fit)
         told = {k: (q.value, q.std) for k, q in quantities.items()}
+        evidence = cause.evidence_of(candidate.hypothesis, told)
+        if self.case.metric == "free run" and not denied("lever_arm", self.agreeing):
+            evidence += _or_alike(candidate.hypothesis)
         return Found(
             candidate.hypothesis.id, candidate.hypothesis.key, cause.title, quantities,
-            candidate.p_value, candidate.p_adjusted,
-            cause.evidence_of(candidate.hypothesis, told), cause.extension,
+            candidate.p_value, candidate.p_adjusted, evidence, cause.extension,
             cause.reference, candidate.gain, candidate.proof.gain, candidate.proof.std,
         )  # fmt: skip
 
@@ -149,7 +151,7 @@ class DiagnosisBuilder:
         changed = found.final is not found.base
         after = self.model(found.final, self.record(found.causes)) if changed else before
         gain, runs, after = self.gain(before, after, validate, found.final)
-        ruling = rule(found, case.held_out, groups, known, gain)
+        ruling = rule(found, case.held_out, groups, known, gain, lines[1])
         final = self.final = ruling.final
         if final is not found.final:
             gain, runs, after = self.gain(before, before, validate, final)
@@ -173,7 +175,7 @@ class DiagnosisBuilder:
             groups=tuple(tuple(c.hypothesis.id for c in pair) for pair in groups),
             gain=gain,
             gain_over_chosen=over_chosen,
-            wrong=_symptoms(case.problem(found.before.integrator), found),
+            wrong=_symptoms(case.problem(found.before.integrator), found, lines[0]),
             residuals={
                 "before": residual_tests(
                     case.problem(found.before.integrator), found.before, ruling.before, lines[0]
@@ -372,11 +374,17 @@ class DiagnosisBuilder:
                 f"{', '.join(turned)} came out negative: some thruster's column has the wrong sign "
                 f"or stands in another's place; greybox check may tell which."
             )
-        if any(self.found.final.point.ship.sensors.lever):
+        sensors = self.found.final.point.ship.sensors
+        if any(sensors.lever):
             out.append(
                 "the gain is measured on the log as its sensors show it; greybox compare moves "
                 "the velocities to the origin, which adds the noise of the yaw rate, times the "
                 "lever arm, to u and v."
+            )
+        elif sensors.turned or sensors.late:
+            out.append(
+                "the gain is of the motion as the log shows it; greybox compare measures the fit "
+                "of the motion that the corrected sensors show, which is another one."
             )
         kept = kept_without_name(self.found)
         if kept:
@@ -388,6 +396,15 @@ class DiagnosisBuilder:
         for change in after.changes:
             out.append(f"the extended model tells the log's own clock: {change.sentence}.")
         return out
+
+
+def _or_alike(hypothesis: Hypothesis) -> str:
+    """Return what else a cause may be where only forces tell, to stand behind its evidence."""
+    if hypothesis.cause == "inertia_coupling":
+        return ", or an antenna ahead or abaft of where the vessel file has it, which looks alike"
+    if any(p.name == "lever_arm_x" for p in hypothesis.parameters):
+        return ", or coupled inertia of sway and yaw, which looks alike"
+    return ""
 
 
 def kept_without_name(found: Search) -> list[str]:
@@ -499,8 +516,8 @@ def _as_shown(before: LogFit, after: LogFit) -> dict[str, Array]:
     return out
 
 
-def _symptoms(problem: Problem, found: Search) -> tuple[Symptom, ...]:
-    told = find_symptoms(problem, found.before)
+def _symptoms(problem: Problem, found: Search, waves: Waves | None) -> tuple[Symptom, ...]:
+    told = find_symptoms(problem, found.before, waves)
     if not told and found.causes:
         told = [
             Symptom(

@@ -131,7 +131,10 @@ def from_chosen(
     names = case.problem(fit.integrator).names
     # each is weighed at the end, by leaving it out
     causes = [assess_candidate(proof, plain, fit, a, len(hypotheses), names) for a in named]
-    others = [a for a in hypotheses if a not in named]
+    coupled = any(a.cause == "inertia_coupling" for a in named)
+    others = [
+        abeam(a) if coupled and a.cause == "lever_arm" else a for a in hypotheses if a not in named
+    ]
     other = search(case, fit, others, begun=[*causes, *late], progress=progress)
     mine = replace(other, base=base, tried=len(hypotheses), chosen=by_data)
     return (case, mine) if _nearer(case, mine.final, case.carried(found.final)) else None

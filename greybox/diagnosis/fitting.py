@@ -301,7 +301,7 @@ class Problem:
             before += len(start)
         return out
 
-    def fit(self, point: Point, noise: Noise, most: int = _MOST, than: float = np.inf) -> Fit:
+    def fit(self, point: Point, noise: Noise, most: int = _MOST, than: float | None = None) -> Fit:
         """Minimise −2 log L over the free numbers at a given noise.
 
         Parameters
@@ -311,9 +311,9 @@ class Problem:
         noise : Noise
         most : int
             Iterations at most.
-        than : float
-            −2 log L of a fit that this one is only compared with: where it stays far above that,
-            it ends once a step is small beside the difference.
+        than : float, optional
+            −2 log L of a fit that this one is only compared with: it ends once a step is small
+            beside the difference.
         """
         low, high = self.bounds(point)
         vector = np.clip(point.vector(), low, high)
@@ -352,7 +352,7 @@ class Problem:
                 normal, damping = None, 0.0
                 continue
             fell = cost - trial_cost
-            little = fell < max(_ENOUGH, DECIDED * (trial_cost - than))
+            little = fell < max(_ENOUGH, _decided(trial_cost, than))
             point, vector, errors, nu, cost = (
                 trial, vector + step, trial_errors, trial_nu, trial_cost,
             )  # fmt: skip
@@ -545,7 +545,7 @@ class Problem:
         nu, cost = self.whitened(noise, fit.errors)
         return replace(fit, noise=noise, nu=tuple(nu), cost=cost)
 
-    def settle(self, fit: Fit, rounds: int = 2, than: float = np.inf) -> Fit:
+    def settle(self, fit: Fit, rounds: int = 2, than: float | None = None) -> Fit:
         """Alternate between the noise and the fit; `than` as in `fit`."""
         for _ in range(rounds):
             if fit.escaped:
@@ -553,9 +553,17 @@ class Problem:
             noise = self.noise_of(fit.errors, fit.point, fit.noise)
             before = self.whitened(noise, fit.errors)[1]
             fit = self.fit(fit.point, noise, than=than)
-            if before - fit.cost < max(0.5, DECIDED * (fit.cost - than)):
+            if before - fit.cost < max(0.5, _decided(fit.cost, than)):
                 break
         return fit
+
+
+def _decided(cost: float, than: float | None) -> float:
+    """Return the fall of −2 log L that decides nothing in a comparison with another fit's."""
+    if than is None:
+        return 0.0
+    beyond = DECIDED * (cost - than)
+    return beyond if beyond > 0 else min(-beyond, _NEAR)
 
 
 def _with(vector: Array, k: int, value: float) -> Array:

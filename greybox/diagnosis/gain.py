@@ -39,7 +39,7 @@ def runs_on(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> list[LogFit]:
 def gains(
     before: Sequence[LogFit], after: Sequence[LogFit], sample_time: float, seed: int
 ) -> dict[str, Gain]:
-    """Return the mean fit (6.12) before and after, by state.
+    """Return the mean fit (6.12) before and after, by state, both of the motion as before.
 
     The interval of the difference is by a circular block bootstrap over the logs'
     samples (Politis and Romano, 1992).
@@ -63,10 +63,12 @@ def gains(
         for ones in whole:
             twos = [next(rest) for _ in ones]
             sizes = [min(len(a.log), len(b.log)) for a, b in zip(ones, twos, strict=True)]
-            parts = [_squares(runs, i, state, sizes) for runs in (ones, twos)]
+            (first, spread), (second, _) = (_squares(r, i, state, sizes) for r in (ones, twos))
             start, length = blocks(sum(sizes), sample_time, _DRAWS, rng)
-            for k, (error, spread) in enumerate(parts):
-                e, s = (block_sums(v, start, length) for v in (error, spread))
+            s = block_sums(spread, start, length)
+            # a sensor that is read otherwise changes what was measured, and must not gain by that
+            for k, error in enumerate((first, second)):
+                e = block_sums(error, start, length)
                 draws[k] += _fit(e, s) / len(whole)
                 point[k] += float(_fit(error.sum(), spread.sum())) / len(whole)
         low, high = np.quantile(draws[1] - draws[0], [0.025, 0.975])

@@ -86,8 +86,8 @@ class Hypothesis:
     variants : tuple of Hypothesis
         The same with other conventions of sampling, of which the likeliest is kept.
     arguments : tuple of str
-        Columns of commands that its force is a function of at the same moment, where it has an
-        `apply` and is one.
+        Signals that its force, or one that looks like it, is a function of at the same moment,
+        where it has an `apply`.
     parity : {0, 1, -1}
         Whether the force of a hypothesis with `arguments` keeps the ship's symmetry of port and
         starboard where its thruster does (1), breaks it (-1), or has parts of both (0).

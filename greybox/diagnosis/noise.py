@@ -9,7 +9,7 @@ and the same filter applied to sensitivities keeps their sums comparable.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import casadi as ca
@@ -132,6 +132,11 @@ class Noise:
     def coloured(self) -> bool:
         """Whether errors are weighed by a colour that was fitted, and not by their size alone."""
         return bool(self.parameters)
+
+    def with_sensors(self, deviations: Array) -> Noise:
+        """Return it with other deviations (ny,) of the sensors."""
+        groups = [replace(g, sensor=deviations[list(g.outputs)]) for g in self.groups]
+        return replace(self, groups=tuple(groups))
 
     @property
     def log_det(self) -> float:
@@ -435,6 +440,35 @@ def assumed_noise(
     return Noise(tuple(found), tuple(chosen))
 
 
+def _known_only(
+    errors: Sequence[Array], known: Sequence[NDArray[np.bool_]] | None
+) -> Sequence[Array]:
+    """Return errors (N, ny) of each log, not a number where nothing was measured."""
+    if known is None:
+        return errors
+    return [np.where(k, e, np.nan) for k, e in zip(known, errors, strict=True)]
+
+
+def white_deviations(
+    errors: Sequence[Array], known: Sequence[NDArray[np.bool_]] | None = None
+) -> Array:
+    """Return the deviations of the sensors that third differences of errors tell, (ny,).
+
+    Parameters
+    ----------
+    errors, known
+        As of `fit_noise`.
+    """
+    measured = _known_only(errors, known)
+
+    def deviation(i: int) -> float:
+        # where no neighbours were measured, of the lines between those that were
+        found = (white_noise([e[:, i] for e in every]) for every in (measured, errors))
+        return max(next((f for f in found if f), 0.0), 1e-12)
+
+    return np.array([deviation(i) for i in range(errors[0].shape[1])])
+
+
 def free_run_noise(
     errors: Sequence[Array],
     groups: Sequence[tuple[int, ...]],
@@ -458,26 +492,16 @@ def free_run_noise(
     known : sequence of ndarray of bool, optional
         (N, ny) where each channel was measured; by default everywhere.
     """
-    filled = errors
-    if known is not None:
-        errors = [np.where(k, e, np.nan) for k, e in zip(known, errors, strict=True)]
-    every = np.concatenate(errors)
+    every = np.concatenate(_known_only(errors, known))
     counts = np.maximum((~np.isnan(every)).sum(axis=0), 1)
     size = np.maximum(np.sqrt(np.nansum(every**2, axis=0) / counts), 1e-12)
-
-    def deviation(i: int) -> float:
-        # where no neighbours were measured, of the lines between those that were
-        found = (white_noise([e[:, i] for e in every]) for every in (errors, filled))
-        return max(next((f for f in found if f), 0.0), 1e-12)
-
+    white = np.zeros(len(size)) if start is not None else white_deviations(errors, known)
     made = []
     for g, group in enumerate(groups):
         k = len(group)
         own = np.ones(k)
         own[0] = size[group[0]]
-        sensor = (
-            np.array([deviation(i) for i in group]) if start is None else start.groups[g].sensor
-        )
+        sensor = white[list(group)] if start is None else start.groups[g].sensor
         numerators = np.zeros((k, k, 1))
         numerators[0, 0, 0] = 1 / own[0]
         made.append(NoiseModel(group, numerators, np.ones(1), np.diag(own), sensor))

@@ -55,6 +55,8 @@ class Prepared:
         As it was given.
     agreeing : frozenset of str
         Causes or places of which the kinematics show nothing though they could, or all there is.
+    together : frozenset of str
+        Channels that the kinematics show to have one clock.
     """
 
     case: DiagnosisProblem
@@ -66,6 +68,7 @@ class Prepared:
     short: tuple[str, ...]
     model: ManoeuvringModel | None
     agreeing: frozenset[str] = frozenset()
+    together: frozenset[str] = frozenset()
 
     @property
     def of_forces(self) -> tuple[Hypothesis, ...]:
@@ -164,7 +167,7 @@ def prepare(
     start = _structure(structure, logs, model)
     require_motion(logs, start)
     duration = min(length for _, length in (*own, *others))
-    context = _context(start, logs, validate, duration, model)
+    context = _context(start, logs, validate, duration, model, kinematics.together)
     # of a clock of one channel the kinematics tell all; an arm or a bias may be shared by all
     told = decided(findings) | {a for a in kinematics.agreeing if a.startswith("clock_offset:")}
     known = [a for c in causes.values() for a in c.hypotheses(context)]
@@ -180,6 +183,7 @@ def prepare(
         tuple(short),
         model,
         kinematics.agreeing | told,
+        kinematics.together,
     )
 
 
@@ -243,7 +247,7 @@ def context_of(structure: Structure, ready: Prepared) -> Context:
     """Return what causes are told of a prepared case, with another structure."""
     case = ready.case
     duration = min(length for _, length in (*case.clocks[0], *case.clocks[1]))
-    return _context(structure, case.logs, case.held_out_logs, duration, ready.model)
+    return _context(structure, case.logs, case.held_out_logs, duration, ready.model, ready.together)
 
 
 def _context(
@@ -252,6 +256,7 @@ def _context(
     validate: Sequence[TrialLog],
     duration: float,
     model: ManoeuvringModel | None,
+    together: frozenset[str],
 ) -> Context:
     first = logs[0]
     speeds = {t.speed: _turning([log[t.speed] for log in logs]) for t in first.vessel.thrusters}
@@ -272,8 +277,31 @@ def _context(
             c: max(float(np.abs(np.diff(x)).max()) for x in v) / first.sample_time
             for c, v in moved.items()
         },
-        derived=frozenset[str]().union(*map(derived_motions, logs)),
+        moves={c: _movement(v) for c, v in moved.items()},
+        derived=together.union(*map(derived_motions, logs)),
+        passage=_passage(logs),
     )
+
+
+def _movement(commands: Sequence[Array]) -> float:
+    """Return the typical size of a movement of a command (N,) of each log, large ones first."""
+    sizes = []
+    for value in commands:
+        steps = np.diff(value)
+        # one movement as long as it goes on the same way
+        begins = np.flatnonzero(np.diff(np.sign(steps), prepend=0.0))
+        sizes.append(np.abs(np.add.reduceat(steps, begins)) if len(begins) else np.zeros(0))
+    every = np.concatenate(sizes)
+    squares = float((every**2).sum())
+    return float((every**3).sum()) / squares if squares else 0.0
+
+
+def _passage(logs: Sequence[TrialLog]) -> float:
+    """Return the time in which the ship sails her length [s], 0 where nothing tells her speed."""
+    if not all("u" in log for log in logs):
+        return 0.0
+    speed = float(np.sqrt(np.mean(np.concatenate([log["u"] for log in logs]) ** 2)))
+    return logs[0].vessel.length / max(speed, 1e-9)
 
 
 def _turning(speeds: Sequence[Array]) -> float:

@@ -36,8 +36,8 @@ SETTLE = 4
 def refit(problem: Problem, fit: Fit, score: Score) -> Fit:
     """Return the fit with one more hypothesis, its noise settled."""
     point = problem.add(fit.point, score.hypothesis, score.value if len(score.value) else None)
-    first = problem.fit(point, fit.noise, most=FIRST)
-    return problem.settle(problem.scan(first, score.hypothesis), 1)
+    first = problem.fit(point, fit.noise, most=FIRST, than=fit.cost)
+    return problem.settle(problem.scan(first, score.hypothesis), 1, fit.cost)
 
 
 def refits(

@@ -90,7 +90,7 @@ class Found:
         Of no such effect; after correction for all causes that were tried.
     evidence, extension, reference : str
     gain : float
-        Fall of −2 log L of the estimation logs.
+        Fall of −2 log L of the estimation logs; not a number where the log itself shows the cause.
     held_out, held_out_std : float
         Fall of −2 log L of logs it was not fitted to, and its standard error; infinite where
         their run leaves every bound without it, and minus that with it.
@@ -105,9 +105,9 @@ class Found:
     evidence: str
     extension: str
     reference: str
-    gain: float = 0.0
-    held_out: float = 0.0
-    held_out_std: float = 0.0
+    gain: float = np.nan
+    held_out: float = np.nan
+    held_out_std: float = np.nan
 
     def to_dict(self) -> dict[str, Any]:
         """Return the cause for JSON."""
@@ -119,7 +119,7 @@ class Found:
             "evidence": self.evidence,
             "extension": self.extension,
             "place": self.key,
-            "likelihood_gain": self.gain,
+            "likelihood_gain": finite(self.gain),
             "held_out_gain": {
                 "value": finite(self.held_out),
                 "std": finite(self.held_out_std),
@@ -132,6 +132,8 @@ class Found:
         """What the cause does for logs that it was not fitted to, in words."""
         if np.isfinite(self.held_out):
             return f"held-out −2 log L falls by {self.held_out:.0f} ± {self.held_out_std:.0f}"
+        if np.isnan(self.gain):
+            return "the log itself shows it, without a free run"
         which = "without" if self.held_out > 0 else "with"
         return f"the held-out free run leaves every bound {which} it"
 

@@ -30,6 +30,7 @@ from greybox.diagnosis.thresholds import (
     SURE,
     WORTH,
 )
+from greybox.diagnosis.waves import Waves, noise_in, squares_in
 from greybox.model.run.step import Integrator
 
 Array = NDArray[np.float64]
@@ -72,6 +73,7 @@ def rule(
     groups: Sequence[Sequence[Candidate]],
     known: Sequence[Found],
     gain: Mapping[str, Gain],
+    waves: Waves | None = None,
 ) -> Ruling:
     """Decide the verdict.
 
@@ -86,6 +88,8 @@ def rule(
         Causes that the log proves without forces.
     gain : mapping of str to Gain
         Fit of the held-out free run without causes and with them.
+    waves : Waves, optional
+        That the logs were sailed in: what they move is nothing that the model should do.
     """
     final, stand, leaning, notes = found.final, found.causes, found.leaning, []
     if final is not found.base and sum(g.after - g.before for g in gain.values()) < 0:
@@ -102,9 +106,11 @@ def rule(
     first = omnibus(diagnosed)
     left = omnibus(pairs) if diagnosed is not pairs else first
     explained = _explained(found, held_out) if stand else 0.0
-    why = _wrong(found.base, final, pairs, left, explained, bool(stand))
+    why = _wrong(found.base, final, pairs, left, explained, bool(stand), waves)
+    anew = ""
     if found.given is not None and not why:
-        why = _other_coefficients(diagnosed, held_out(found.base.integrator).pairs(found.base))
+        anew = _other_coefficients(diagnosed, held_out(found.base.integrator).pairs(found.base))
+        why = anew
     if not (why or stand or known) and final is not found.base:
         taken = 1 - np.exp(held_out(final.integrator).worse(final, found.base))
         why = (
@@ -121,9 +127,11 @@ def rule(
         verdict = DiagnosisVerdict.CONFUSED
     else:
         verdict = DiagnosisVerdict.UNEXPLAINED if why else DiagnosisVerdict.NONE
+    # of the squared error that the diagnosed model had
+    kept = float(np.exp(held_out(final.integrator).worse(final, found.before))) if stand else 1.0
     return Ruling(
-        verdict, named, leaning, _remaining(final, pairs, left, why),
-        _next(verdict, groups), first, left, final, tuple(notes),
+        verdict, named, leaning, _remaining(final, pairs, left, why, kept, waves),
+        _next(verdict, groups, bool(anew)), first, left, final, tuple(notes),
     )  # fmt: skip
 
 
@@ -132,7 +140,7 @@ def leaves_more(found: Search, held_out: Callable[[Integrator], HeldOut]) -> boo
     pairs = held_out(found.final.integrator).pairs(found.final)
     explained = _explained(found, held_out) if found.causes else 0.0
     left = omnibus(pairs)
-    return bool(_wrong(found.base, found.final, pairs, left, explained, bool(found.causes)))
+    return bool(_wrong(found.base, found.final, pairs, left, explained, bool(found.causes), None))
 
 
 def _explained(found: Search, held_out: Callable[[Integrator], HeldOut]) -> float:
@@ -143,8 +151,9 @@ def _explained(found: Search, held_out: Callable[[Integrator], HeldOut]) -> floa
 
 
 def _wrong(
-    base: Fit, final: Fit, pairs: Sequence[Pair], left: Omnibus, explained: float, found: bool
-) -> str:
+    base: Fit, final: Fit, pairs: Sequence[Pair], left: Omnibus, explained: float, found: bool,
+    waves: Waves | None,
+) -> str:  # fmt: skip
     """Return what is wrong with what a model leaves; nothing where nothing is."""
     numbers = sum(int(pair.held.counts.sum()) for pair in pairs)
     if left.proof.p_value < SURE and left.gain > max(WORTH * numbers, LEFT_OVER * explained):
@@ -156,7 +165,7 @@ def _wrong(
     other = disagreement(pairs)
     if other.p_value < APART and other.fall > RELEVANT * numbers + BESIDE * explained:
         return "the coefficients that fit these logs do not fit the held-out ones"
-    before, after = _excess(base, final), _excess(final, final)
+    before, after = _excess(base, final, pairs, waves), _excess(final, final, pairs, waves)
     # a cause that leaves much of the error where it was is not what is wrong, or not alone
     if found and after > LARGE and after > MOST_OF * before:
         return f"the causes leave {100 * after / before:.0f} % of the squared error"
@@ -165,7 +174,7 @@ def _wrong(
             f"in all logs a force moves the ship that lasts longer than gusts "
             f"({GUST:g} s): a current that changes, or an effect that belongs to no known cause"
         )
-    return _no_prediction(pairs)
+    return _no_prediction(pairs, waves)
 
 
 def _other_coefficients(given: Sequence[Pair], anew: Sequence[Pair]) -> str:
@@ -192,11 +201,11 @@ def _other_coefficients(given: Sequence[Pair], anew: Sequence[Pair]) -> str:
     )
 
 
-def _no_prediction(pairs: Sequence[Pair]) -> str:
+def _no_prediction(pairs: Sequence[Pair], waves: Waves | None) -> str:
     """Return how far held-out free runs are from what sensors show; nothing where they are near."""
     if any(p.held_fit.escaped for p in pairs):
         return "the held-out free run leaves every bound"
-    missed, constant = _missed(pairs), _against_constant(pairs)
+    missed, constant = _missed(pairs, waves), _against_constant(pairs)
     far = {s: m for s, m in missed.items() if m > SENSORS}
     if far:
         told = ", ".join(f"{word(s)} by {m:.0f}" for s, m in far.items())
@@ -232,10 +241,13 @@ def _about_mean(run: LogRun) -> Array:
     return np.asarray(run.y - run.y.sum(axis=0, where=run.known) / counts)
 
 
-def _missed(pairs: Sequence[Pair]) -> dict[str, float]:
+def _missed(pairs: Sequence[Pair], waves: Waves | None) -> dict[str, float]:
     """Return the root mean square held-out error of each state in its sensor's deviations."""
     names = pairs[0].problem.runs[0].outputs
-    squares, counts = np.sum([p.held_fit.in_sensors() for p in pairs], axis=0)
+    shown = [p.held_fit for p in pairs]
+    squares, counts = np.sum(
+        [squares_in(waves, fit, names, noise_in(waves, fit)) for fit in shown], axis=0
+    )
     missed = np.sqrt(squares / np.maximum(counts, 1))
     groups = pairs[0].held_fit.noise.groups
     return {names[g.outputs[0]]: float(m) for g, m in zip(groups, missed, strict=True)}
@@ -260,21 +272,24 @@ def _drifts(pairs: Sequence[Pair]) -> bool:
     return bool(slow.any())
 
 
-def _excess(fit: Fit, final: Fit) -> float:
+def _excess(fit: Fit, final: Fit, pairs: Sequence[Pair], waves: Waves | None) -> float:
     """Return the mean squared error of the states in the sensors' variances, less their own."""
-    squares, counts = fit.in_sensors(final.noise)
+    names = pairs[0].problem.runs[0].outputs
+    squares, counts = squares_in(waves, fit, names, noise_in(waves, final))
     return float(squares.sum() / counts.sum()) - 1.0
 
 
-def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> str:
+def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str, kept: float,
+               waves: Waves | None) -> str:  # fmt: skip
     problem = pairs[0].problem
     # of the logs that it was fitted to, or of the first part of them
     fit = final if pairs[0].fit.escaped else problem.forgetful(pairs[0].fit, np.inf)
-    moved = coloured(fit, problem.runs[0].outputs)
+    # of a line no colour tells
+    moved = "" if waves else coloured(fit, problem.runs[0].outputs)
     tail = f" In these logs {moved}." if moved else ""
     if why:
         return f"What is left is not only noise: {why}.{tail}"
-    missed = {s: m for s, m in _missed(pairs).items() if m > NEAR}
+    missed = {s: m for s, m in _missed(pairs, waves).items() if m > NEAR}
     if missed:
         told = ", ".join(f"{word(s)} by {m:.0f}" for s, m in missed.items())
         tail = (
@@ -282,22 +297,31 @@ def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str) -> st
             f"as gusts do.{tail}"
         )
     if left.proof.p_value < SURE and left.explicable > 0:
+        share = f"{100 * left.explicable:.1f} % of the squared errors"
+        if 0 < kept < 1:
+            share += f" that are left, {100 * left.explicable * kept:.2g} % of those before"
         return (
-            f"What is left follows hardly anything that is known of the motion: forces that belong "
-            f"to no known cause would explain another {100 * left.explicable:.1f} % of the squared "
-            f"errors (p = {left.proof.p_value:.1g}), too little to matter.{tail}"
+            f"Forces that belong to no known cause would explain another {share} "
+            f"(p = {left.proof.p_value:.1g}): too little to change the verdict.{tail}"
         )
     return f"What is left cannot be told from {'gusts' if missed else 'noise'}.{tail}"
 
 
-def _next(verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]]) -> list[str]:
+def _next(
+    verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]], anew: bool
+) -> list[str]:
     out = [
         f"design a trial that tells {' from '.join(ids)}: greybox design --vessel V "
         f"--between {' '.join(f'MODEL.{file_word(i)}.json' for i in ids[:2])} --duration 900 "
         f"--out plan.csv"
         for ids in ([c.hypothesis.id for c in pair] for pair in groups)
     ]
-    if verdict in (DiagnosisVerdict.UNEXPLAINED, DiagnosisVerdict.PARTLY):
+    if anew:
+        out.append(
+            "estimate the model's coefficients from these logs: greybox estimate LOGS --vessel V "
+            "--out estimated.json"
+        )
+    elif verdict in (DiagnosisVerdict.UNEXPLAINED, DiagnosisVerdict.PARTLY):
         out.append(
             "measure what the model does not know (wind, depth, draught, propeller and rudder as "
             "they really moved), repeat a run of these logs, and diagnose both together"

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.diagnosis.causes.sensors import alike_to_forces
 from greybox.diagnosis.evidence.held_out import HeldOut, Proof, proof_of
 from greybox.diagnosis.evidence.omnibus import omnibus
 from greybox.diagnosis.evidence.remainder import MOTION_AND_COMMANDS, contributions_beside
@@ -292,7 +293,10 @@ def _completed(
     """Return the step to a second cause that leaves nothing to motion and commands, if one does."""
     tried = len(hypotheses)
     present = [h for h in hypotheses if not h.past]
-    second = take_step(case, fit, causes, present, tried - len(present))
+    second = take_step(
+        case, fit, causes, present, tried - len(present),
+        enough=lambda found: not _left_to_motion(case, found),
+    )  # fmt: skip
     if second.taken is None:
         return None
     fit, found = _with(case, causes, second.taken, tried)
@@ -313,12 +317,17 @@ def take_step(
     causes: Sequence[Candidate],
     hypotheses: Sequence[Hypothesis],
     passed_over: int = 0,
+    enough: Callable[[Fit], bool] = lambda _: True,
 ) -> Step:
     """Score what is left, refit the best, and take the likeliest if it holds.
 
-    As many more than those given were tried as were passed over.
+    As many more than those given were tried as were passed over. One whose fit is not enough is
+    not taken.
     """
     left = [a for a in hypotheses if not _taken(a, causes)]
+    if case.metric == "free run":
+        # beside chosen terms the one does all that the other does
+        left = [a for a in left if not any(alike_to_forces(a, c.hypothesis) for c in causes)]
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
     near = [a for a in left if not a.refit_from_scratch]
     scores, forgetful = promises(problem, fit, near)
@@ -338,6 +347,8 @@ def take_step(
     candidates = _beside_others(candidates)
     sure = (_wald_checked(case, c) for c in candidates if c.holds)
     taken = next((c for c in sure if c.holds), None)
+    if taken is not None and not enough(taken.fit):
+        taken = None
     if taken is not None:
         better = final_refit(case, taken.fit, taken.hypothesis)
         taken = _wald_checked(case, replace(taken, fit=better))
@@ -504,6 +515,13 @@ def _needed(case: DiagnosisProblem, fit: Fit, without: Fit) -> bool:
     return without.escaped or case.held_out(fit.integrator).worse(without, fit) > np.log1p(WORTH)
 
 
+def _of_the_ship(case: DiagnosisProblem, fit: Fit, cause: Candidate) -> bool:
+    """Whether a cause is what the ship does: sensors and changes have a name, or are none."""
+    ship = fit.point.ship
+    rest = case.problem(fit.integrator).drop(fit.point, cause.hypothesis).ship
+    return ship.sensors == rest.sensors and ship.changes == rest.changes
+
+
 def weighed(case: DiagnosisProblem, found: Search) -> Search:
     """Return the search without causes that do not stand beside a generic force.
 
@@ -525,7 +543,7 @@ def weighed(case: DiagnosisProblem, found: Search) -> Search:
         least, without = min(fallen, key=lambda item: _worth(item[0]))
         leaning.append(least)
         stood = [item for item in stood if item[0] is not least]
-        if _needed(case, found.final, without):
+        if _of_the_ship(case, found.final, least) and _needed(case, found.final, without):
             continue
         if without.escaped:
             # what does not stand holds the run within bounds: nothing of it can be told
@@ -609,7 +627,7 @@ def _without(problem: Problem, fit: Fit, cause: Candidate) -> Fit:
         begun.append((cost, point))
     point = min(begun, key=lambda item: item[0])[1]
     found = problem.fit(point, fit.noise, most=FIRST)
-    return problem.settle(found, 2, np.inf if found.converged else fit.cost)
+    return problem.settle(found, 2, None if found.converged else fit.cost)
 
 
 def _at_null(problem: Problem, fit: Fit, hypothesis: Hypothesis) -> Array:

@@ -14,6 +14,7 @@ from greybox.diagnosis.noise import SEEN
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import Symptom
 from greybox.diagnosis.ship import LogRun
+from greybox.diagnosis.waves import Waves, noise_in
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,7 +33,7 @@ def word(name: str) -> str:
     return _WORDS.get(name, name)
 
 
-def find_symptoms(problem: Problem, fit: Fit) -> list[Symptom]:
+def find_symptoms(problem: Problem, fit: Fit, waves: Waves | None = None) -> list[Symptom]:
     """Return what the free run gets wrong beyond noise, the largest first.
 
     Parameters
@@ -40,11 +41,13 @@ def find_symptoms(problem: Problem, fit: Fit) -> list[Symptom]:
     problem : Problem
     fit : Fit
         Of the model before any cause.
+    waves : Waves, optional
+        In its errors.
     """
     outputs = problem.runs[0].outputs
     sensor = {
         outputs[i]: float(s)
-        for g in fit.noise.groups for i, s in zip(g.outputs, g.sensor, strict=True)
+        for g in noise_in(waves, fit).groups for i, s in zip(g.outputs, g.sensor, strict=True)
     }  # fmt: skip
     errors, measured = np.concatenate(fit.errors), np.concatenate(problem.known)
     conditions = _joined(problem, fit)

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS
 from greybox.diagnosis.causes.cause import Cause
+from greybox.diagnosis.noise import Noise, white_deviations
+from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import Found, Quantity
 
 Array = NDArray[np.float64]
@@ -91,8 +93,11 @@ def find_waves(
     width = float(np.sqrt(((frequency - centre) ** 2 * excess).sum() / excess.sum()))
     _, raw, _ = _spectrum([e[:, use] for e in errors], sample_time)
     step = frequency[1] - frequency[0]
-    floor = np.median(raw[inside & ~near], axis=0) if (inside & ~near).any() else 0.0
-    energy = np.maximum(raw[near] - floor, 0.0).sum(axis=0) * step
+    # what stands above the sensors' noise, from where slower errors end
+    whole = (raw / raw.sum(axis=0)).mean(axis=1)
+    lowest = int(np.argmin(np.convolve(whole, np.ones(3) / 3, mode="same")[: k + 1]))
+    floor = np.median(raw[-(len(raw) // 4) :], axis=0)
+    energy = np.maximum((raw[lowest:] - floor).sum(axis=0), 0.0) * step
     return Waves(
         centre,
         max(width / np.sqrt(max(count, 1)), step / np.sqrt(12 * max(count, 1))),
@@ -100,6 +105,38 @@ def find_waves(
         float(ratio[k]),
         p,
     )
+
+
+def noise_in(waves: Waves | None, fit: Fit) -> Noise:
+    """Return the noise of a fit, in waves with the sensors that third differences tell.
+
+    Colours have no line: of errors that hold one they take all for the sensors', or nothing.
+    """
+    if waves is None:
+        return fit.noise
+    return fit.noise.with_sensors(white_deviations(fit.errors, fit.known))
+
+
+def squares_in(
+    waves: Waves | None, fit: Fit, names: Sequence[str], noise: Noise
+) -> tuple[Array, NDArray[np.int_]]:
+    """Return what `Fit.in_sensors` does, without the motion in waves.
+
+    Parameters
+    ----------
+    waves : Waves or None
+    fit : Fit
+    names : sequence of str
+        Channels, in their order.
+    noise : Noise
+        Whose sensors.
+    """
+    squares, counts = fit.in_sensors(noise)
+    if waves is not None:
+        moved = np.array([waves.std.get(names[g.outputs[0]], 0.0) for g in noise.groups])
+        sensor = np.array([g.sensor[0] for g in noise.groups])
+        squares = np.maximum(squares - counts * (moved / sensor) ** 2, 0.0)
+    return squares, counts
 
 
 def _spectrum(parts: Sequence[Array], sample_time: float) -> tuple[Array, Array, int]:

@@ -128,7 +128,7 @@ def test_what_cannot_be_told_apart_has_the_power_of_chance(model) -> None:
     )
     request = request_of(vessel=ship)
     power, motion = power_of(
-        request, replace(model, vessel=ship), {"thruster_lag:speed": {}, "thruster_lag:command": {}}
+        request, replace(model, vessel=ship), {"thruster_lag:force": {}, "thruster_lag:command": {}}
     )
     assert (power.report(motion).power < 0.01).all()
     assert power.values(motion)[0] < -3

@@ -8,10 +8,11 @@ from math import factorial
 import numpy as np
 import pytest
 
-from greybox.diagnosis.causes.sensors import LeverArm, abeam
+from greybox.diagnosis.causes.sensors import LeverArm, abeam, alike_to_forces
 from greybox.diagnosis.chosen import _with_sensors
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import prepare
+from greybox.diagnosis.search import Candidate, _of_the_ship
 from greybox.model.run.step import MONOTONE, Integrator
 from greybox.study.blind import draw
 from greybox.trial.log import TrialLog
@@ -82,6 +83,8 @@ def test_only_the_place_abeam_of_an_antenna_is_sought_beside_coupled_inertia() -
     trial = draw(np.random.default_rng([4, 2]), (), samples=200, positions=False)
     ready = prepare([trial.estimation], [trial.validation], None, "thesis", ["lever_arm"])
     (arm,) = ready.hypotheses
+    # forces of motion and commands imitate it
+    assert {"u", "v", "r"} < {*arm.arguments}
     ship = ready.base().point.ship
     length = trial.estimation.vessel.length
     assert [p.high for p in arm.parameters] == [length, length / 2]
@@ -89,5 +92,15 @@ def test_only_the_place_abeam_of_an_antenna_is_sought_beside_coupled_inertia() -
     assert [p.name for p in other.parameters] == ["lever_arm_y"]
     assert other.apply is not None
     assert other.apply(ship, np.array([0.3])).sensors.lever == (0, 0.3)
+    # a sensor's defect has a name, or is no part of a model
+    problem, base = ready.case.problem("rk4"), ready.base()
+    moved = replace(base, point=problem.add(base.point, arm, np.array([1.0, 0.0])))
+    found = Candidate(arm, moved, 0.0, 0.0, 0.0, None)  # type: ignore[arg-type]
+    assert not _of_the_ship(ready.case, replace(moved, integrator="rk4"), found)
+    coupling = replace(arm, cause="inertia_coupling", key="inertia_coupling:Y_r", parameters=())
+    assert alike_to_forces(arm, coupling)
+    assert alike_to_forces(coupling, arm)
+    assert not alike_to_forces(other, coupling)
+    assert not alike_to_forces(coupling, coupling)
     said = LeverArm().evidence({"lever_arm_y": (-2.0, 0.1)})
     assert said == "the velocities are those of a point 2.00 ± 0.10 m to port of the origin"

@@ -16,7 +16,7 @@ from greybox.diagnosis.linear import NOWHERE, sensitivities
 from greybox.diagnosis.noise import Likelihood, Noise, NoiseModel, fit_noise
 from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.null_model import _as_it_should_be
-from greybox.diagnosis.point import Point
+from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.scores import ProjectedScores
 from greybox.diagnosis.ship import (
     Change,
@@ -28,7 +28,7 @@ from greybox.diagnosis.ship import (
     wired,
 )  # fmt: skip
 from greybox.diagnosis.simulator import VaryingSimulator
-from greybox.diagnosis.waves import find_waves
+from greybox.diagnosis.waves import find_waves, noise_in, squares_in
 from greybox.model.catalogue import get_structure
 from greybox.model.run.simulation import simulate
 from greybox.model.run.step import StepModel
@@ -373,6 +373,30 @@ def test_waves_are_a_line_and_humps_are_not() -> None:
     assert found.std["u"] == pytest.approx(np.sqrt(2), rel=0.2)
     hump = np.array([np.convolve(c, np.ones(4), "same") for c in quiet.T]).T
     assert find_waves([hump], [hump], ("u", "v", "r"), 1.0) is None
+
+
+def test_in_waves_third_differences_tell_the_sensors_and_the_sea_is_no_misfit() -> None:
+    rng = np.random.default_rng(8)
+    t = 0.5 * np.arange(3000)
+    # a sea of some width: the phase wanders
+    phase = 2 * np.pi * 0.12 * t + np.cumsum(0.1 * rng.standard_normal(len(t)))
+    errors = 0.1 * np.sin(phase)[:, None] + 0.03 * rng.standard_normal((len(t), 2))
+    groups = [(0,), (1,)]
+    poles = np.array([0.9, 0.9])
+    noise = fit_noise([errors], poles, 0.5, groups)
+    nu = noise.whiten(errors[:, :, None])[:, :, 0]
+    known = np.ones(errors.shape, bool)
+    fit = Fit(None, noise, 0.0, (nu,), (errors,), True, "rk4", (known,))  # type: ignore[arg-type]
+    waves = find_waves([nu], [errors], ("u", "v"), 0.5)
+    assert waves is not None
+    assert waves.std["u"] == pytest.approx(0.1 / np.sqrt(2), rel=0.1)
+    told = noise_in(waves, fit)
+    np.testing.assert_allclose([g.sensor[0] for g in told.groups], 0.03, rtol=0.15)
+    assert noise_in(None, fit) is noise
+    squares, counts = squares_in(waves, fit, ("u", "v"), told)
+    assert (squares / counts < 2).all()
+    whole, _ = squares_in(None, fit, ("u", "v"), told)
+    assert (whole / counts > 5).all()
 
 
 def test_every_cause_says_what_it_is(log: TrialLog) -> None:

@@ -48,6 +48,7 @@ def test_coefficients_that_do_not_hold_here_are_wrong(sailed) -> None:
     assert "estimating the coefficients of the model again lowers the squared error" in (
         found.remaining
     )
+    assert found.next_steps[0].startswith("estimate the model's coefficients from these logs")
     # what is told to be wrong is of the model as it is, not of one that was mended
     assert any("yaw rate" in s.sentence for s in found.wrong)
     assert found.model.theta.tolist() == other.theta.tolist()

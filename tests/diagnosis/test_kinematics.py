@@ -57,6 +57,17 @@ def test_sensors_of_foreign_ships_agree(ship: str, tmp_path: Path) -> None:
     assert {"lever_arm", "heading_bias"} <= found.agreeing
 
 
+def test_heading_and_yaw_rate_that_agree_have_one_clock(tmp_path: Path) -> None:
+    vessel, paths = write_campaign(tmp_path, "workboat-12m", ["zigzag-20"], 3)
+    path, ship = paths[0], load_vessel(vessel)
+    log = read_log(path, ship)
+    # velocities of the antenna that has the positions: nothing to compare these with
+    alone = replace(log, channels={n: x for n, x in log.channels.items() if n not in ("u", "v")})
+    found = judged_by_kinematics([alone])
+    assert found.together == {"r", "psi"}
+    assert judged_by_kinematics([log]).together == frozenset()
+
+
 def test_without_positions_nothing_is_known() -> None:
     trial = draw(np.random.default_rng(3), positions=False, samples=200)
     found = judged_by_kinematics([trial.estimation])

@@ -19,7 +19,7 @@ from greybox.diagnosis.gain import gains
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import context_of, prepare
 from greybox.diagnosis.result import Found, Gain, Quantity, _gain_lines
-from greybox.diagnosis.search import Candidate, _beside_others, freed, search
+from greybox.diagnosis.search import Candidate, _beside_others, _of_the_ship, freed, search
 from greybox.model.terms import mirror_sign, parse_term
 from greybox.study.blind import draw
 from greybox.trial.segments import join_segments, split_segments
@@ -72,6 +72,14 @@ def test_what_comes_beside_a_cause_counts_as_freed(ready) -> None:
     # what was free already costs nothing
     again = replace(hypothesis, co_freed=(*hypothesis.co_freed, "Xu"))
     assert freed(base, replace(base, point=problem.add(base.point, again)), again) == 2 + 5
+
+
+def test_what_moves_the_ship_may_stay_without_a_name(ready) -> None:
+    base = ready.base()
+    (hypothesis,) = ready.hypotheses
+    point = ready.case.problem(base.integrator).add(base.point, hypothesis)
+    found = Candidate(hypothesis, base, 0.0, 0.0, 0.0, None)  # type: ignore[arg-type]
+    assert _of_the_ship(ready.case, replace(base, point=point), found)
 
 
 def test_a_run_that_leaves_every_bound_is_said_in_words() -> None:
@@ -147,6 +155,29 @@ def test_the_gain_is_the_fit_of_whole_logs_whatever_their_gaps() -> None:
         whole = average_fit(runs)
         for state, gain in found.items():
             assert getattr(gain, told) == pytest.approx(whole[state], abs=1e-9)
+
+
+def test_a_sensor_that_is_read_otherwise_gains_nothing_by_a_larger_motion() -> None:
+    log, model = virtual_log(5, 400), thesis_model()
+    before = run_model(model, log)
+    # the same error of a channel that now moves twice as much
+    sway = model.structure.states.index("v")
+    moved = before.x.copy()
+    moved[:, sway] += log["v"]
+    other = replace(log, channels={**log.channels, "v": 2 * log["v"]})
+    after = replace(before, log=other, x=moved)
+    found = gains([before], [after], 1.0, 0)["v"]
+    assert found.after == pytest.approx(found.before, abs=1e-9)
+    assert found.ci == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_what_the_log_shows_by_itself_has_no_gain() -> None:
+    found = Found("waves", "waves", "waves", {}, 1e-9, 1e-8, "e", "x", "r")
+    told = found.to_dict()
+    assert told["likelihood_gain"] is None
+    assert told["held_out_gain"]["value"] is None
+    assert found.proved == "the log itself shows it, without a free run"
+    json.dumps(told, allow_nan=False)
 
 
 def test_all_causes_count_as_tried_though_only_some_are_left() -> None:

@@ -126,6 +126,25 @@ def test_a_ship_has_one_lag_one_delay_and_one_limit() -> None:
     assert _taken(two, [known])
 
 
+def test_speeds_are_all_commands_where_nothing_has_an_angle() -> None:
+    pair = [{"type": "fixed", "y": y, "speed": n} for y, n in ((-0.3, "n_port"), (0.3, "n_star"))]
+    ship = vessel(*pair)
+    lags = list(hypotheses(ship, "thruster_lag"))
+    assert lags[:2] == ["thruster_lag:force", "thruster_lag:command"]
+    assert next(iter(hypotheses(ship, "input_delay"))) == "input_delay"
+    for cause in ("thruster_lag", "input_delay"):
+        assert f"{cause}:speed" not in hypotheses(ship, cause)
+    own = replace(ship, actuation=Actuation(lag=1.0, lag_on="speed"))
+    assert list(hypotheses(own, "thruster_lag")) == ["thruster_lag:force", "thruster_lag:speed"]
+
+
+def test_a_limit_makes_movements_late_by_more_than_sampling_does() -> None:
+    # all the way in a second as logged; late by half of what a movement takes
+    (limit, *_) = hypotheses(vessel(RUDDER), "rate_limit").values()
+    (time,) = limit.parameters
+    assert time.least == pytest.approx(1.0 + 2 * 0.75)
+
+
 def test_a_cause_held_at_its_value_is_in_force_and_lets_no_other_of_its_kind_in() -> None:
     ship = Ship(np.zeros(1), np.zeros(2), vessel(RUDDER))
     lags = hypotheses(ship.vessel, "thruster_lag")

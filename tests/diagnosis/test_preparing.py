@@ -10,7 +10,7 @@ import pytest
 from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.null_model import clocks_of
-from greybox.diagnosis.preparing import prepare
+from greybox.diagnosis.preparing import _movement, prepare
 from greybox.diagnosis.ship import Ship
 from greybox.diagnosis.symptoms import find_symptoms
 from greybox.errors import LogError, UsageError
@@ -155,3 +155,11 @@ def test_what_was_not_measured_does_not_count() -> None:
     assert problem.squares(fit.errors)[0] == pytest.approx(squares)
     told = [s.sentence for s in find_symptoms(problem, fit)]
     assert not any("times what its sensor's noise explains" in sentence for sentence in told)
+
+
+def test_a_movement_goes_on_as_long_as_a_command_goes_the_same_way() -> None:
+    # up by 2 in two samples, and back by 1
+    ramp = np.array([0.0, 0.0, 1.0, 2.0, 2.0, 1.0])
+    assert _movement([ramp]) == pytest.approx((2**3 + 1**3) / (2**2 + 1**2))
+    assert _movement([ramp, ramp[:2]]) == _movement([ramp])
+    assert _movement([np.ones(5)]) == 0.0

@@ -45,8 +45,13 @@ class Context:
         Largest less smallest value of each command.
     fastest : mapping of str to float
         Fastest change of each command from sample to sample [per second].
+    moves : mapping of str to float
+        Typical size of a movement of each command from one rest or turn to the next.
     derived : frozenset of str
-        Velocities and yaw rate that were made of other channels, and have the clock of those.
+        Velocities and yaw rate that were made of other channels, or shown to have the clock of
+        those.
+    passage : float
+        Time in which the ship sails her length [s]; 0 where nothing tells her speed.
     """
 
     structure: Structure
@@ -59,7 +64,9 @@ class Context:
     current_known: bool = False
     ranges: Mapping[str, float] = field(default_factory=dict)
     fastest: Mapping[str, float] = field(default_factory=dict)
+    moves: Mapping[str, float] = field(default_factory=dict)
     derived: frozenset[str] = frozenset()
+    passage: float = 0.0
 
     def lacking(self, *terms: str) -> tuple[str, ...]:
         """Return the named terms that the structure allows but does not contain.

@@ -49,10 +49,16 @@ def _single_commands(context: Context) -> tuple[str, ...]:
     return moving if len(commands) > 1 else ()
 
 
-def _together(context: Context, words: Sequence[str]) -> tuple[str, ...]:
-    """Return the words for what may be late together; a single angle has its column's name."""
-    several = len(context.vessel.angle_commands) > 1
-    return tuple(w for w in words if w != "angle" or several)
+def _together(context: Context, words: Sequence[str], own: str = "command") -> tuple[str, ...]:
+    """Return the words for what may be late together; a single angle has its column's name.
+
+    Where nothing has an angle, one word does for the commands and the speeds: the vessel's own.
+    """
+    angles = len(context.vessel.angle_commands)
+    skipped = {"angle"} if angles < 2 else set()
+    if not angles:
+        skipped.add("command" if own == "speed" else "speed")
+    return tuple(w for w in words if w not in skipped)
 
 
 def _may_be_measured(context: Context) -> bool:
@@ -156,7 +162,8 @@ class ThrusterLag(Cause):
         longest = min(_LONGEST, _SHARE * context.duration)
         first = 2 * context.sample_time
         actuation = context.vessel.actuation
-        words = _together(context, get_args(LagOn))
+        words: tuple[str, ...] = get_args(LagOn)
+        together = _together(context, words, actuation.lag_on)
 
         def lag(on: str, held: LagHeld, variants: tuple[Hypothesis, ...] = ()) -> Hypothesis:
             def apply(ship: Ship, value: Array) -> Ship:
@@ -177,7 +184,7 @@ class ThrusterLag(Cause):
         speeds = {t.speed for t in context.vessel.thrusters}
         # a single propeller speed is all of them, and a ship has one lag
         own = [c for c in _single_commands(context) if {c} != speeds and c not in words]
-        places = words if context.vessel.actuation.lag else (*words, *own)
+        places = together if actuation.lag else (*together, *own)
         # a simulated trial may hold another value than the mean during a sample
         return [lag(on, "mean", (lag(on, "start"), lag(on, "end"))) for on in places]
 
@@ -235,9 +242,8 @@ class InputDelay(Cause):
         # a ship has one delay; what steers may be late together, and what drives
         places = ["command"]
         if not context.vessel.actuation.delay:
-            if len({t.speed for t in context.vessel.thrusters}) > 1:
-                places.append("speed")
-            places += _together(context, ("angle",))
+            several = len({t.speed for t in context.vessel.thrusters}) > 1
+            places += _together(context, ("speed", "angle") if several else ("angle",))
             places += [c for c in _single_commands(context) if c not in words]
         return [delay(on) for on in places]
 
@@ -282,10 +288,12 @@ class RateLimit(Cause):
             # the number is the time of the whole way, which is zero without a limit
             quick = way / fastest
             times = [quick / share for share in _RATES]
+            # a movement is late by half the time that it takes: on average, so many samples
+            late = 2 * UNRESOLVED * context.sample_time * way / context.moves.get(column, way)
             unit = f"{context.vessel.unit(column) or 'n'}/s"
             parameter = Parameter(
                 f"rate_{column}", unit, times[0], 0.0,
-                quick / _LEAST_RATE, step=1e-3 * quick, least=quick, over=way,
+                quick / _LEAST_RATE, step=1e-3 * quick, least=quick + late, over=way,
             )  # fmt: skip
             out.append(
                 Hypothesis(

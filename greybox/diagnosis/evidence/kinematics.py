@@ -50,10 +50,13 @@ class Kinematics:
     agreeing : frozenset of str
         Causes, or their places, of which they show nothing though they could: the sensors agree
         with each other. Only a defect that all of them share would not show.
+    together : frozenset of str
+        Channels that show one time, which may be late against all else.
     """
 
     findings: tuple[Finding, ...] = ()
     agreeing: frozenset[str] = frozenset()
+    together: frozenset[str] = frozenset()
 
 
 def judged_by_kinematics(logs: Sequence[TrialLog]) -> Kinematics:
@@ -76,8 +79,14 @@ def judged_by_kinematics(logs: Sequence[TrialLog]) -> Kinematics:
         {place for o in report.outcomes if o.status == "clean" for place in _places(o)}
         for report in reports
     ]
+    together = [
+        {c for o in report.outcomes if o.status == "cannot tell" for c in o.channels}
+        for report in reports
+    ]
     return Kinematics(
-        tuple(f for f in each[0] if _place(f) in shared), frozenset(set.intersection(*clean))
+        tuple(f for f in each[0] if _place(f) in shared),
+        frozenset(set.intersection(*clean)),
+        frozenset(set.intersection(*together)),
     )
 
 

@@ -149,9 +149,9 @@ def _moved(
     numbers, covariance = problem.covariance(fit)
     own = covariance[np.ix_(where, where)]
     null = np.zeros(len(where))
-    tested = np.ones(len(where), bool)
+    tested, coarse = np.ones(len(where), bool), np.zeros(len(where))
     if hypothesis.apply is not None:
-        null = np.array([p.null for p in hypothesis.parameters])
+        null, coarse = np.array([(p.null, p.coarse) for p in hypothesis.parameters]).T
         # a number with many hills has no null
         tested = np.array([p.reach == 0 for p in hypothesis.parameters])
     if not np.isfinite(own).all() or not tested.any():
@@ -163,7 +163,8 @@ def _moved(
     share = float(np.clip(-(away @ inverse @ far) / size, 0.0, 1.0)) if size > 0 else 0.0
     near = away + share * far
     passed = float(chdtrc(int(tested.sum()), float(near @ inverse @ near)))
-    told = away**2 / np.maximum(np.diag(own)[tested] + far**2 + scatter[tested] ** 2, 1e-300)
+    more = far**2 + scatter[tested] ** 2 + coarse[tested] ** 2
+    told = away**2 / np.maximum(np.diag(own)[tested] + more, 1e-300)
     return np.hypot(moved, scatter), passed, float(chdtrc(1, told.max()))
 
 

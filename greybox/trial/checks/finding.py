@@ -142,7 +142,8 @@ class Outcome:
     sentence : str
         What was looked at, or why nothing in the log can show it.
     channels : tuple of str
-        Of a check of several channels, those that would have shown it.
+        Of a check of several channels, those that would have shown it; where it cannot tell,
+        those that agree with each other and may all have it.
     """
 
     id: str

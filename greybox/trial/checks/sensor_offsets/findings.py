@@ -388,7 +388,7 @@ def _heading_clock_outcome(campaign: Campaign, together: str) -> Outcome:
     else:
         return Outcome("clock_offset", "clean", said)
     said += f"; no {lacks} to compare {alone} with: whether they do too cannot be told"
-    return Outcome("clock_offset", "cannot tell", said)
+    return Outcome("clock_offset", "cannot tell", said, ("r", "psi"))
 
 
 def _clock_outcome(campaign: Campaign, information: Array, basis: Array, together: str) -> Outcome:
