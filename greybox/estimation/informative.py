@@ -25,6 +25,8 @@ _ROUNDING = 1e-9
 # a command is held where it moves by less than this share of its size (an angle, of 1 rad), and by
 # no more than so many times the white noise that neighbouring samples show
 _STEADY, _WHITE = 0.02, 1.3
+# samples with a jump from which on a column holds orders
+_JUMPS = 3
 
 
 def heading_range(logs: Sequence[TrialLog]) -> float:
@@ -113,6 +115,31 @@ def is_noise(logs: Sequence[TrialLog], name: str, share: float) -> bool:
     values = [log.forces((name,)).ravel() for log in logs]
     size = float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
     return share < _STEADY and size < _WHITE * (white_noise(values) or 0.0)
+
+
+def orders_logged(logs: Sequence[TrialLog]) -> list[str]:
+    """Say which columns moved faster than the vessel file lets them: they hold orders.
+
+    Where ``[actuation]`` states how orders act, that is known already.
+    """
+    vessel, step = logs[0].vessel, logs[0].sample_time
+    if vessel.actuation or all(t.drive == "command" for t in vessel.thrusters):
+        return []
+    said = []
+    for name, limits in vessel.limits.items():
+        if limits.rate is None or name not in logs[0]:
+            continue
+        moved = np.concatenate([np.abs(np.diff(log[name])) for log in logs])
+        # what a sample holds may be the mean of two
+        if np.sum(moved > 2 * limits.rate * step) >= _JUMPS:
+            said.append(
+                f"{name} moved by {moved.max():.3g} within a sample of {step:g} s and its rate in "
+                f"the vessel file is {limits.rate:.3g} per second: the column holds orders, not "
+                f"what the actuator did. Log its feedback, or state lag or rate_limit in "
+                f"[actuation]: a model of orders that jump does not hold for a plan whose orders "
+                f"do not."
+            )
+    return said
 
 
 def cancelled(structure: Structure, share: Mapping[str, float]) -> tuple[list[str], list[str]]:

@@ -17,6 +17,7 @@ from greybox.errors import ExcitationError, GreyboxError, LogError, OutOfTimeErr
 from greybox.estimation.closed_loop import Loop
 from greybox.estimation.covariance import Covariance
 from greybox.estimation.efficiency_bounds import limits_of
+from greybox.estimation.informative import orders_logged
 from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.prediction_verdict import (
     NOT_JUDGED,
@@ -218,7 +219,7 @@ def estimate_requested(logs: Sequence[TrialLog], request: Request) -> Estimate:
 
 def _estimated(logs: Sequence[TrialLog], request: Request) -> Estimate:
     """Return the estimate that is chosen while time is left, the first one at any rate."""
-    notes: list[str] = []
+    notes = orders_logged(logs)
     if all(n is None for n in (request.method, *_named(request))):
         logs = at_own_pace(logs, notes)
     estimate = _first_choice(logs, request, notes)

@@ -37,8 +37,9 @@ _FORCE = {
     "race_drag": ["X_race_drag"],
     "rudder_drag": ["X_rudder_drag", "X_|u|u*rudder_drag"],
 }
-# what every ship has, and what selection never takes away
-_CORE = "Xu Yv Nr".split()
+# what every ship has, and what selection never takes away: without thrust a constant speed is a
+# trap, since neither it nor resistance alone explains anything
+_CORE = "Xu Xmu Yv Nr".split()
 
 
 @lru_cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from virtual import PARAMETERS, virtual_log, write_csv
 
 from greybox.commands.main import main
 from greybox.errors import ExcitationError, UsageError
-from greybox.estimation.informative import require_informative
+from greybox.estimation.informative import orders_logged, require_informative
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.predictor import build_predictor
 from greybox.model.predictor_kinds import PREDICTORS
@@ -34,6 +35,7 @@ from greybox.validation.criteria import independent_samples, information_criteri
 from greybox.validation.fit import run_model
 from greybox.vessel.force import force_inputs
 from greybox.vessel.toml import vessel_from_dict
+from greybox.vessel.vessel import Actuation
 
 ABSENT = ("Xkappa", "Yvr", "Nvv", "Wvv", "Wuv")
 STRONG = {"Xvr", "Xmu", "Yur", "Ymu", "Nr", "Nmu"}
@@ -304,3 +306,20 @@ def test_propellers_to_both_sides_that_turn_alike_have_no_moment_to_estimate():
     # alone, or apart in speed, they have one
     apart = make_log(single, channels, 1.0)
     assert structures_to_try([apart], wind=False) == ["thesis", "linear"]
+
+
+def test_columns_that_jump_faster_than_their_rate_hold_orders():
+    row = {"type": "azimuth", "speed": "n", "angle": "a", "angle_rate": 0.35, "speed_rate": 8.0}
+    vessel = vessel_from_dict({"name": "Boat", "length": 6.0, "thruster": [row]})
+    angle = np.repeat([0.0, 0.5, -0.5, 0.2], 20)
+    speed = np.linspace(4, 20, 80)
+    motion = {n: np.ones(80) for n in ("u", "v", "r", "psi")}
+    log = make_log(vessel, motion | {"a": angle, "n": speed}, 0.5)
+    (said,) = orders_logged([log])
+    assert said.startswith(
+        "a moved by 1 within a sample of 0.5 s and its rate in the vessel file is 0.35 per second"
+    )
+    ramp = make_log(vessel, motion | {"a": np.linspace(-0.5, 0.5, 80), "n": speed}, 0.5)
+    assert orders_logged([ramp]) == []
+    lagging = replace(vessel, actuation=Actuation(lag=1.0))
+    assert orders_logged([replace(log, vessel=lagging)]) == []
