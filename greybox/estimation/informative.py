@@ -118,28 +118,29 @@ def is_noise(logs: Sequence[TrialLog], name: str, share: float) -> bool:
 
 
 def orders_logged(logs: Sequence[TrialLog]) -> list[str]:
-    """Say which columns moved faster than the vessel file lets them: they hold orders.
+    """Say in one note which columns moved faster than the vessel file lets them: orders do.
 
     Where ``[actuation]`` states how orders act, that is known already.
     """
     vessel, step = logs[0].vessel, logs[0].sample_time
     if vessel.actuation or all(t.drive == "command" for t in vessel.thrusters):
         return []
-    said = []
+    jumps = []
     for name, limits in vessel.limits.items():
         if limits.rate is None or name not in logs[0]:
             continue
         moved = np.concatenate([np.abs(np.diff(log[name])) for log in logs])
         # what a sample holds may be the mean of two
         if np.sum(moved > 2 * limits.rate * step) >= _JUMPS:
-            said.append(
-                f"{name} moved by {moved.max():.3g} within a sample of {step:g} s and its rate in "
-                f"the vessel file is {limits.rate:.3g} per second: the column holds orders, not "
-                f"what the actuator did. Log its feedback, or state lag or rate_limit in "
-                f"[actuation]: a model of orders that jump does not hold for a plan whose orders "
-                f"do not."
-            )
-    return said
+            fastest = float(moved.max()) / step
+            jumps.append(f"{name} ({fastest:.3g} per second, its rate is {limits.rate:.3g})")
+    if not jumps:
+        return []
+    return [
+        f"moved faster than the vessel file lets them: {', '.join(jumps)}. Such columns hold "
+        f"orders, not what actuators did, and a model of orders that jump does not hold for a plan "
+        f"whose orders do not. Log the feedback, or state lag or rate_limit in [actuation]."
+    ]
 
 
 def cancelled(structure: Structure, share: Mapping[str, float]) -> tuple[list[str], list[str]]:

@@ -317,7 +317,7 @@ def test_columns_that_jump_faster_than_their_rate_hold_orders():
     log = make_log(vessel, motion | {"a": angle, "n": speed}, 0.5)
     (said,) = orders_logged([log])
     assert said.startswith(
-        "a moved by 1 within a sample of 0.5 s and its rate in the vessel file is 0.35 per second"
+        "moved faster than the vessel file lets them: a (2 per second, its rate is 0.35). Such"
     )
     ramp = make_log(vessel, motion | {"a": np.linspace(-0.5, 0.5, 80), "n": speed}, 0.5)
     assert orders_logged([ramp]) == []
