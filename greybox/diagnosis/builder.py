@@ -390,8 +390,8 @@ class DiagnosisBuilder:
         if kept:
             out.append(
                 f"the extended model keeps {', '.join(kept)}, no better than a generic force: "
-                f"without it held-out free runs are worse by more than {WORTH:.0%} of the squared "
-                f"error."
+                f"without it held-out free runs are worse by more than {100 * WORTH:g} % of the "
+                f"squared error."
             )
         for change in after.changes:
             out.append(f"the extended model tells the log's own clock: {change.sentence}.")

@@ -610,7 +610,8 @@ def _stands(cause: Candidate) -> bool:
     if cause.told is not None:
         return True
     # what it does for held-out logs is weighed beside a generic force, where misfit hides less
-    return cause.standing is not None and cause.standing.stands and cause.counts
+    helps = cause.counts and cause.proof.gain > 0
+    return cause.standing is not None and cause.standing.stands and helps
 
 
 def _worth(cause: Candidate) -> float:

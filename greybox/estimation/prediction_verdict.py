@@ -40,6 +40,11 @@ class JudgedOn(StrEnum):
     OWN = "own"
 
 
+def seconds(time: float) -> str:
+    """Return a time [s] with its unit, whole seconds of a long one."""
+    return f"{time:.3g} s" if time < 1000 else f"{time:.0f} s"
+
+
 @dataclass(frozen=True)
 class PredictionLimits:
     """The limits of the levels.
@@ -188,7 +193,7 @@ class RunsDiverge(Reason):
         """How many, and when."""
         return (
             f"its free run diverges in {len(self.logs)} of {self.count} runs, first after "
-            f"{self.after:.3g} s"
+            f"{seconds(self.after)}"
         )
 
 
@@ -203,7 +208,7 @@ class RefitsDiverge(RunsDiverge):
         """How many, and when."""
         return (
             f"estimated without a part of the logs its free run on this part diverges in "
-            f"{len(self.logs)} of {self.count} runs, first after {self.after:.3g} s"
+            f"{len(self.logs)} of {self.count} runs, first after {seconds(self.after)}"
         )
 
 
@@ -314,7 +319,7 @@ class LargeError(Reason):
         """By how much, or from when on a constant is better."""
         who = channel_words(self.channel)
         if self.error >= 1:
-            when = f"after {self.horizon:.3g} s" if self.horizon > 0 else "from the start"
+            when = f"after {seconds(self.horizon)}" if self.horizon > 0 else "from the start"
             return f"{who} is worse than a constant {when}"
         # what is above a limit must not be rounded to it
         digits = 0 if round(100 * self.error) > round(100 * self.limit) else 1
@@ -609,7 +614,7 @@ class PredictionVerdict(DisplayMixin):
                 if c.bands is None
                 else f"{100 * c.bands.share:.0f} % ({100 * c.bands.interval[0]:.0f}-"
                 f"{100 * c.bands.interval[1]:.0f})",
-                f"to the end ({c.horizon:.3g} s)" if c.lasting else f"{c.horizon:.3g} s",
+                f"to the end ({seconds(c.horizon)})" if c.lasting else seconds(c.horizon),
                 "" if c.moves else "hardly moved",
             )
             for c in self.channels

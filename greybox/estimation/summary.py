@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 
-from greybox.estimation.prediction_verdict import JudgedOn
+from greybox.estimation.prediction_verdict import JudgedOn, seconds
 from greybox.estimation.tried import told
 from greybox.estimation.values import EstimateValues
 from greybox.estimation.verdict import TestResult
@@ -41,7 +41,7 @@ def summarise(estimate: EstimateValues) -> str:
         judged = estimate.prediction
         on = ""
         if judged.judged_on is JudgedOn.VALIDATION:
-            on = f"; on {judged.judged_words}, {judged.samples * estimate.sample_time:.3g} s"
+            on = f"; on {judged.judged_words}, {seconds(judged.samples * estimate.sample_time)}"
         lines += _wrapped(f"Prediction: {judged.text}{on}", "  ")
     meant = estimate.meant
     lines += _wrapped(f"Coefficients: {meant.verdict.text}", "  ")

@@ -17,7 +17,7 @@ from greybox.diagnosis.evidence.remainder import (
 )
 from greybox.diagnosis.evidence.standing import Standing, _own_arguments, standing
 from greybox.diagnosis.preparing import prepare
-from greybox.diagnosis.search import FIRST, Search, weighed
+from greybox.diagnosis.search import FIRST, Search, _stands, weighed
 from greybox.study.blind import draw
 from greybox.vessel.vessel import Thruster, Vessel
 
@@ -53,6 +53,17 @@ def proof(gain: float, p: float) -> Proof:
 def test_what_makes_a_cause_stand(beyond, share, half, clear, told, stands) -> None:
     found = Standing(proof(*beyond), share, half, np.zeros(1), clear, told, tried=20)
     assert found.stands is stands
+
+
+def test_what_makes_held_out_logs_less_likely_has_no_name() -> None:
+    def candidate(gain: float) -> SimpleNamespace:
+        return SimpleNamespace(
+            told=None, standing=SimpleNamespace(stands=True), counts=True, proof=proof(gain, 0.5)
+        )
+
+    assert _stands(candidate(1.0))
+    assert _stands(candidate(np.inf))
+    assert not _stands(candidate(-200.0))
 
 
 @pytest.fixture(scope="module")
