@@ -72,8 +72,9 @@ def _conclude(score: ScoreStatistic, agree: bool) -> Conclusion:
     if agree:
         return Conclusion("the instruments agree.", True, {})
     return Conclusion(
-        "the instruments contradict each other: the model lacks something that the inputs move, or "
-        "the logs differ from one another.",
+        "the instruments contradict each other, since the simulated motion still explains the "
+        "residuals: the model lacks something that the inputs move, or the logs differ from one "
+        "another.",
         False,
         {},
     )

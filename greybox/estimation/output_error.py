@@ -489,9 +489,10 @@ def _result(fitted: _Fitted, logs: Sequence[TrialLog], options: OutputErrorOptio
     measured_both = np.concatenate([d.known[:-1] & d.known[1:] for d in data])
     errors = errors[measured_both] if measured_both.any() else errors
     notes = []
-    held = [n for n, b in zip(model.parameters, bound, strict=True) if b]
+    ended = zip(model.parameters, fit.p, bound, strict=True)
+    held = [f"{name} at {value:.3g}" for name, value, at_bound in ended if at_bound]
     if held:
-        notes.append(f"{', '.join(held)} ended at a bound; its standard error is not known.")
+        notes.append(f"ended at a bound, where no standard error is known: {', '.join(held)}.")
     if "psi" in model.outputs:
         notes.append("the heading was simulated and compared with the measured one.")
     return Estimate(

@@ -563,7 +563,7 @@ class TestRestrictions:
         i = [c.name for c in predictor.columns].index("Xu")
         assert found.theta[i] == pytest.approx(-0.03)
         assert found.std[i] == 0
-        assert any("Xu ended at a bound" in n for n in found.notes)
+        assert any("ended at a bound" in n and "Xu at " in n for n in found.notes)
         assert np.isfinite(found.covariance).all()
 
     def test_a_sharp_prior_holds_its_parameter(self, predictor, noisy):
