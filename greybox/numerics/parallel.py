@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
+from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -39,8 +39,9 @@ ENVIRONMENT = "GREYBOX_CLUSTER"
 _DEATHS = 3
 # seconds within which a scheduler answers, and within which one without workers gets one
 _ANSWER, _PATIENCE = 10.0, 60.0
-# seconds between looks at whether the first process still runs
-_LOOK = 0.5
+# seconds between looks at whether processes still run, and looks that find none in a row before it
+# counts: ended ones are about to be replaced
+_LOOK, _LOOKS = 0.5, 10
 # names under which Dask reports on what ends as one sentence here
 _LOGGERS = ("distributed", "tornado.application")
 _log = logging.getLogger(__name__)
@@ -334,7 +335,7 @@ def _collected(
             begun = set(multiprocessing.active_children()) - here
             while given < count:
                 if given not in found:
-                    found[given] = waiting.pop(given).result()
+                    found[given] = _worked(pool, waiting.pop(given))
                 yield found.pop(given)
                 given += 1
         except BrokenProcessPool as error:
@@ -355,6 +356,25 @@ def _collected(
     # processes that are kept for the next map stay
     if isinstance(pool, ProcessPoolExecutor):
         pool.shutdown()
+
+
+def _worked(pool: Any, future: Future[Any]) -> Any:
+    """Return a result, unless no worker is left that could make it.
+
+    Raises
+    ------
+    BrokenProcessPool
+        All have ended. Those that are kept end when they have rested for a while, and what is given
+        to them at that moment may wait for ever.
+    """
+    idle = 0
+    while not wait([future], timeout=_LOOK).done:
+        alive = any(p.is_alive() for p in list((pool._processes or {}).values()))
+        idle = 0 if alive else idle + 1
+        if idle == _LOOKS:
+            _stop(pool, set())
+            raise BrokenProcessPool("no worker is left")
+    return future.result()
 
 
 def _stop(pool: Any, begun: set[Any]) -> None:

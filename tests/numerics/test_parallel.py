@@ -11,8 +11,11 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +24,7 @@ from virtual import virtual_log, write_csv
 from greybox.commands.main import main
 from greybox.errors import ClusterError, ExcitationError, WorkerError
 from greybox.numerics.effort import seconds_left, within
-from greybox.numerics.parallel import lanes, map_forked, map_pieces, on_cluster
+from greybox.numerics.parallel import _worked, lanes, map_forked, map_pieces, on_cluster
 from greybox.vessel.toml import example_vessel
 
 # in a process of its own: a test runner has threads, and copies are then not made
@@ -73,6 +76,7 @@ assert all(alone == 1 for _, _, alone in found)
 DYING = """
 import os, sys
 from pathlib import Path
+from types import SimpleNamespace
 from greybox.errors import WorkerError
 from greybox.numerics.parallel import map_pieces
 
@@ -95,6 +99,7 @@ else:
 LONG = """
 import os, sys, time
 from pathlib import Path
+from types import SimpleNamespace
 from greybox.numerics.parallel import map_pieces
 
 def piece(k):
@@ -321,3 +326,15 @@ def test_a_scheduler_that_is_not_there_is_one_sentence(tmp_path, capsys, monkeyp
         "there with 'dask scheduler' and workers with 'dask worker tcp://127.0.0.1:9', correct the "
         "address, or leave --cluster and GREYBOX_CLUSTER out.\n"
     )
+
+
+def test_what_no_worker_is_left_to_make_is_not_waited_for(monkeypatch):
+    monkeypatch.setattr("greybox.numerics.parallel._LOOK", 0.01)
+    ended: list[dict] = []
+    pool = SimpleNamespace(_processes={}, shutdown=lambda **how: ended.append(how))
+    with pytest.raises(BrokenProcessPool, match="no worker is left"):
+        _worked(pool, Future())
+    assert ended == [{"kill_workers": True}]
+    made = Future()
+    made.set_result(3)
+    assert _worked(pool, made) == 3
