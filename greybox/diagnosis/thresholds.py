@@ -36,6 +36,10 @@ OWN_SHARE, LEAST_SHARE = 0.8, 0.5
 # basin, where at one standard error a current stood
 SAME = 0.32
 
+# standard error of a clock that only forces tell of, as a share of the time in which the ship sails
+# her length: forces without a term shifted the motion of a foreign container ship by 0.05 and 0.08
+PHASE = 0.05
+
 # -- causes do equally well (confusion) --------------------------------------------------------
 # probability with which chance makes rivals differ so much on held-out logs
 CHANCE = 0.05

@@ -67,7 +67,7 @@ def find_waves(
     sample_time : float
         [s]
     """
-    from scipy.ndimage import median_filter
+    from scipy.ndimage import median_filter, uniform_filter1d
     from scipy.special import chdtrc
 
     use = [i for i, n in enumerate(names) if n != "psi"]
@@ -94,8 +94,8 @@ def find_waves(
     _, raw, _ = _spectrum([e[:, use] for e in errors], sample_time)
     step = frequency[1] - frequency[0]
     # what stands above the sensors' noise, from where slower errors end
-    whole = (raw / raw.sum(axis=0)).mean(axis=1)
-    lowest = int(np.argmin(np.convolve(whole, np.ones(3) / 3, mode="same")[: k + 1]))
+    whole = (raw / np.maximum(raw.sum(axis=0), 1e-300)).mean(axis=1)
+    lowest = int(np.argmin(uniform_filter1d(whole, 3, mode="nearest")[: k + 1]))
     floor = np.median(raw[-(len(raw) // 4) :], axis=0)
     energy = np.maximum((raw[lowest:] - floor).sum(axis=0), 0.0) * step
     return Waves(

@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.ship import Ship, Wire
+from greybox.diagnosis.thresholds import PHASE
 from greybox.notebook import with_error
 
 Array = NDArray[np.float64]
 
 # clocks that are looked for differ by less [s]
 _LATEST = 60.0
-# share of the time in which a ship sails her length by which forces that no term has may shift a
-# motion: a container ship's with propeller race and rudder inflow did by 0.05 and 0.08
-_PHASE = 0.05
 # samples by which a hold between samples may pass for a clock
 UNRESOLVED = 0.75
 
@@ -144,7 +142,7 @@ class ClockOffset(Cause):
             parameter = Parameter(
                 f"clock_{name}", "s", 0.5 * context.sample_time, -most, most,
                 step=0.1 * context.sample_time, least=UNRESOLVED * context.sample_time,
-                coarse=_PHASE * context.passage,
+                coarse=PHASE * context.passage,
             )  # fmt: skip
             out.append(
                 Hypothesis(
