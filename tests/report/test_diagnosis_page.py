@@ -424,7 +424,7 @@ def test_runs_that_end_before_their_log():
 
 @pytest.mark.long
 def test_causes_that_need_no_force_model():
-    kinematic = replace(BIAS, key="heading_bias:kinematics", gain=0.0)
+    kinematic = replace(BIAS, key="heading_bias:kinematics", gain=np.nan)
     shown = text_of(
         render(diagnosis_page(replace(diagnosis_of("named"), causes=(kinematic,)), RECORD))
     )
