@@ -16,7 +16,7 @@ from greybox.errors import ExportError
 
 _LIMIT = 300
 # contracted products would differ from machine to machine
-FLAGS = ("-shared", "-fPIC", "-O2", "-ffp-contract=off", "-fvisibility=hidden")
+FLAGS = ("-shared", "-fPIC", "-O3", "-ffp-contract=off", "-fvisibility=hidden")
 
 
 def find_compiler() -> list[str] | None:

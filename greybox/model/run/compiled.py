@@ -1,7 +1,7 @@
 """The loop of a step over samples as machine code, where a C compiler is there and it pays.
 
 CasADi interprets the instructions of a step. A compiler makes the same of them in the same order,
-which gives the same numbers in a fifteenth of the time (15 ns against 250 ns for a step of the
+which gives the same numbers in a twenty-fifth of the time (6.5 ns against 170 ns for a step of the
 thesis's ship), but takes a few tenths of a second. So a step is compiled once so much of it was
 interpreted as takes as long, and what is compiled is kept in a folder of the user's for later runs.
 """
@@ -28,20 +28,34 @@ _STEP, _LOOP = "greybox_step", "greybox_loop"
 
 
 def _loop_text(step: ca.Function, carried: int) -> str:
-    """Return C code of the loop, to stand behind that of the step."""
-    arguments, results = step.n_in(), step.n_out()
+    """Return C code of the loop, to stand behind that of the step.
+
+    The step sees variables of the loop alone, which a compiler keeps in registers.
+    """
+    takes = [step.numel_in(i) for i in range(step.n_in())]
+    gives = [step.numel_out(i) for i in range(step.n_out())]
+    kept = [f"now{i}[j] = " if i < carried else "" for i in range(len(gives))]
     lines = [
         f"void {_LOOP}(long long samples, const double* const* given, double* const* out) {{",
-        f"  const double* arg[{arguments}];",
-        f"  double* res[{results}];",
         "  long long k;",
-        *(f"  arg[{i}] = given[{i}];" for i in range(arguments)),
-        *(f"  res[{i}] = out[{i}];" for i in range(results)),
+        "  int j;",
+        *(f"  double now{i}[{n}];" for i, n in enumerate(takes)),
+        *(f"  double next{i}[{n}], *restrict out{i} = out[{i}];" for i, n in enumerate(gives)),
+        f"  double* res[] = {{{', '.join(f'next{i}' for i in range(len(gives)))}}};",
+        f"  const double* arg[] = {{{', '.join(f'now{i}' for i in range(len(takes)))}}};",
+        f"  const double* read = given[{carried}];",
+        *(
+            f"  for (j = 0; j < {n}; j++) now{i}[j] = given[{i}][j];"
+            for i, n in enumerate(takes)
+            if i != carried
+        ),
         "  for (k = 0; k < samples; k++) {",
+        f"    for (j = 0; j < {takes[carried]}; j++) now{carried}[j] = *read++;",
         f"    {_STEP}(arg, res, 0, 0, 0);",
-        *(f"    arg[{i}] = res[{i}];" for i in range(carried)),
-        f"    arg[{carried}] += {step.numel_in(carried)};",
-        *(f"    res[{i}] += {step.numel_out(i)};" for i in range(results)),
+        *(
+            f"    for (j = 0; j < {n}; j++) *out{i}++ = {kept[i]}next{i}[j];"
+            for i, n in enumerate(gives)
+        ),
         "  }",
         "}",
     ]
@@ -53,7 +67,8 @@ def _source(step: ca.Function, loop: str) -> str:
     generator = ca.CodeGenerator("step", {"casadi_int": "int", "casadi_real": "double"})
     given = [ca.SX.sym(step.name_in(i), step.sparsity_in(i)) for i in range(step.n_in())]
     generator.add(ca.Function(_STEP, given, step.call(given)))
-    return str(generator.dump()) + SHOWN + loop
+    # the step is part of the loop, so that it need not go to memory for what it carries
+    return f"#define CASADI_SYMBOL_EXPORT static\n{generator.dump()}{SHOWN}{loop}"
 
 
 class Loop:
