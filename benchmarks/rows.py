@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from greybox.estimation.informative import regime_of
 from greybox.model.catalogue import get_structure
+from greybox.model.run.kernels import FreeRunKernel, FreeRunStep
 from greybox.model.run.simulation import simulate
+from greybox.model.run.step import StepModel
 from greybox.study.chapter6 import START, TRUE, pulse_forces
 from greybox.study.efficiency import CASES, SENSOR_VARIANCE, virtual_trial
 
@@ -159,9 +161,10 @@ def thesis_loop(th: Array, tau: Array, start: Array, out: Array) -> None:
 def free_run(samples: int) -> Iterator[Row]:
     """Time a run of the thesis's ship, heading simulated.
 
-    The difference equations by a loop and by Numba; the differential equations between samples by
-    `solve_ivp` at its default tolerance, which must not step over a change of the command, against
-    the Runge-Kutta rule here. Both steps are machine code by then, as Numba's loop is.
+    The difference equations by a loop and by Numba, which is compared with the bare loop here too;
+    the differential equations between samples by `solve_ivp` at its default tolerance, which must
+    not step over a change of the command, against the Runge-Kutta rule here. Both steps are machine
+    code by then, as Numba's loop is.
     """
     for rule in ("euler", "rk4"):
         simulate(STRUCTURE, THETA, START, pulse_forces(_COMPILES), 1.0, integrator=rule)
@@ -169,6 +172,14 @@ def free_run(samples: int) -> Iterator[Row]:
     loop, compiled, ivp = "loop over NumPy arrays", "numba", "scipy.integrate.solve_ivp"
     found: dict[str, Array] = {}
     made: list[Callable[..., None]] = []
+    kernel = FreeRunKernel(FreeRunStep(StepModel.free(STRUCTURE, "euler")).function, samples)
+    kernel.start[:3], kernel.read[:] = START, tau
+    kernel.constants = [THETA, np.ones(1)]
+
+    def bare() -> None:
+        found["here"] = np.empty((samples + 1, 4))
+        found["here"][0] = kernel.start
+        kernel(found["here"][1:])
 
     def here(rule: Literal["euler", "rk4"] = "euler") -> None:
         run = simulate(STRUCTURE, THETA, START, tau, 1.0, integrator=rule)
@@ -206,6 +217,8 @@ def free_run(samples: int) -> Iterator[Row]:
 
     discrete = {loop: (by_loop, ""), compiled: (by_numba, 'pip install ".[bench]"')}
     yield from compare("free-run", samples, "samples", here, discrete, agreement)
+    alone = {f"{compiled}, loops alone": discrete[compiled]}
+    yield from compare("free-run", samples, "samples", bare, alone, lambda _: agreement(compiled))
     yield from compare(
         "free-run", samples, "samples", lambda: here("rk4"), {ivp: (by_ivp, "")}, agreement
     )

@@ -64,10 +64,11 @@ def initial_state(log: TrialLog, states: tuple[str, ...]) -> Array:
 
 def state_bound(log: TrialLog, states: tuple[str, ...]) -> Array:
     """Return the magnitude past which a simulated state counts as diverged, (nx,)."""
-    x = log.states(states)
+    seen = [log[name][log.known([name])] for name in states]
     # a plan holds its start only, which says nothing of what the ship will reach
-    bound = np.where(np.ptp(x, axis=0) > 0, DIVERGENCE_FACTOR * np.abs(x).max(axis=0), _ANY_SHIP)
-    return np.asarray(bound)
+    return np.array(
+        [DIVERGENCE_FACTOR * np.abs(x).max() if np.ptp(x) > 0 else _ANY_SHIP for x in seen]
+    )
 
 
 def simulate_log(

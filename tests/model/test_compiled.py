@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 
+import casadi as ca
 import numpy as np
 import pytest
 from virtual import virtual_log
@@ -12,7 +13,7 @@ from greybox.estimation.informative import regime_of
 from greybox.estimation.output_setup import measured, output_model, output_predictor
 from greybox.model.catalogue import get_structure
 from greybox.model.run import compiled
-from greybox.model.run.kernels import FreeRunKernel, FreeRunStep
+from greybox.model.run.kernels import FreeRunKernel, FreeRunStep, shallow
 from greybox.model.run.output_runs import Filter, Simulator
 from greybox.model.run.step import StepModel
 from greybox.numerics import machine_code, recursion
@@ -67,6 +68,44 @@ def test_a_free_run_is_the_same_to_the_last_bit(cache, interpreted):
     (library,) = cache.iterdir()
     assert cache.stat().st_mode & 0o777 == 0o700
     assert library.suffix == ".so"
+
+
+def chain(step):
+    """Return how many operations on two numbers wait for one another."""
+    waits, longest = {}, 0
+    for k in range(step.n_instructions()):
+        source, target = step.instruction_input(k), step.instruction_output(k)
+        if step.instruction_id(k) in (ca.OP_INPUT, ca.OP_CONST):
+            waits[target[0]] = 0
+        elif step.instruction_id(k) != ca.OP_OUTPUT:
+            waits[target[0]] = max(waits[i] for i in source) + len(source) - 1
+            longest = max(longest, waits[target[0]])
+    return longest
+
+
+def test_sums_in_another_order_are_the_same_to_rounding():
+    x, c = ca.SX.sym("x", 3), ca.SX.sym("c", 4)
+    a, b, r = x[0] * x[1], x[1], ca.fabs(x[2])
+    again = (a + b) + (a + b + c[0])
+    halves = ca.sin(0.5 * r + 0.5 * r + c[1] * r) - c[2]
+    rows = ca.vertcat(again, halves, c[0] * r + c[3] * r + x[0] + c[2] * b + 2)
+    plain = ca.Function("plain", [x, c], [rows])
+    given = np.random.default_rng(0).standard_normal((2, 4))
+    step = shallow(plain, 1)
+    found, expected = (f(given[0, :3], given[1]) for f in (step, plain))
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+    assert step.n_instructions() < plain.n_instructions()
+
+
+@pytest.mark.parametrize("rule", ["euler", "rk4"])
+def test_a_step_of_free_runs_is_that_of_the_model_by_a_shorter_chain(rule):
+    model = StepModel.free(STRUCTURE, rule)
+    step, given = FreeRunStep(model).function, [0.8, -0.1, 0.02, 0.3]
+    tau, theta = pulse_forces(30)[25], [TRUE[n] for n in STRUCTURE.parameters]
+    still = np.zeros(len(STRUCTURE.disturbances)), given[:2]
+    expected = model.function(given[:3], given[3], tau, *still, theta, 1.0)
+    np.testing.assert_allclose(step(given, tau, theta, 1.0), expected, rtol=1e-14)
+    assert chain(step) < 0.8 * chain(model.function)
 
 
 @needs_compiler

@@ -61,7 +61,8 @@ def modulus_log():
     tau = make_log(vessel, commands, 1.0).forces(structure.inputs)
     theta = np.array([values[n] for n in structure.parameters])
     run = simulate(structure, theta, np.array([1.0, 0.0, 0.0]), tau[:-1], 1.0)
-    x = run.x[0] + rng.standard_normal((samples, 3)) * [0.02, 0.01, 1e-3]
+    # as it is recorded: rounding errors of the simulation do not decide which sets are tried
+    x = (run.x[0] + rng.standard_normal((samples, 3)) * [0.02, 0.01, 1e-3]).round(9)
     channels = commands | dict(zip("uvr", x.T, strict=True)) | {"psi": run.psi[0]}
     return make_log(vessel, channels, 1.0, "modulus")
 

@@ -10,6 +10,7 @@ take machine code in place of the first form where that pays, see `greybox.model
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -94,7 +95,65 @@ def _free_run_step(step: FreeRunStep) -> ca.Function:
         s.dt,
     )
     after += ca.vertcat(*[value.get(f"w_{name}", none) for name in step.model.states])
-    return ca.Function("step", [s.state, w, s.theta, s.dt], [ca.densify(after)], {"cse": True})
+    given = [s.state, w, s.theta, s.dt]
+    return shallow(ca.Function("step", given, [ca.densify(after)], {"cse": True}), 1)
+
+
+def shallow(step: ca.Function, carried: int) -> ca.Function:
+    """Return a step that adds early what is ready early, and factors in common only once.
+
+    A processor waits for the longest chain of operations from one state to the next, which in a
+    sum in the order of its terms holds every addition.
+
+    Parameters
+    ----------
+    step : casadi.Function
+        SX.
+    carried : int
+        How many arguments are handed on. What follows from the others alone is ready before.
+    """
+    given = [ca.SX.sym(step.name_in(i), step.sparsity_in(i)) for i in range(step.n_in())]
+    results = [ca.SX(step.sparsity_out(i)) for i in range(step.n_out())]
+    before = -step.n_instructions()
+    # of each number its summands, behind the binary operations that each waits for
+    work: dict[int, list[tuple[int, ca.SX]]] = {}
+
+    def total(summands: list[tuple[int, ca.SX]]) -> tuple[int, ca.SX]:
+        # what is no sum stays as it is, to be known as the same factor elsewhere
+        if len(summands) == 1:
+            return summands[0]
+        shares: dict[object, tuple[int, int, ca.SX, ca.SX]] = {}
+        for i, (wait, x) in enumerate(summands):
+            product = x.is_op(ca.OP_MUL)
+            share, of = (x.dep(0), x.dep(1)) if product else (x, ca.SX(1))
+            key = of.element_hash() if product else (i,)
+            if key in shares:
+                share += shares[key][2]
+            shares[key] = wait, i, share, of
+        heap = [(wait, i, share * of) for wait, i, share, of in shares.values()]
+        heapq.heapify(heap)
+        while len(heap) > 1:
+            (_, _, one), (wait, i, other) = heapq.heappop(heap), heapq.heappop(heap)
+            heapq.heappush(heap, (wait + 1, i, one + other))
+        return heap[0][0], heap[0][2]
+
+    for k in range(step.n_instructions()):
+        op = step.instruction_id(k)
+        source, target = step.instruction_input(k), step.instruction_output(k)
+        if op == ca.OP_OUTPUT:
+            results[target[0]].nz[target[1]] = total(work[source[0]])[1]
+        elif op == ca.OP_INPUT:
+            wait = 0 if source[0] < carried else before
+            work[target[0]] = [(wait, given[source[0]].nz[source[1]])]
+        elif op == ca.OP_CONST:
+            work[target[0]] = [(before, ca.SX(step.instruction_constant(k)))]
+        elif op == ca.OP_ADD:
+            work[target[0]] = work[source[0]] + work[source[1]]
+        else:
+            waits, x = zip(*(total(work[i]) for i in source), strict=True)
+            made = (ca.SX.unary if len(x) == 1 else ca.SX.binary)(op, *x)
+            work[target[0]] = [(max(waits) + len(x) - 1, made)]
+    return ca.Function("step", given, results, {"cse": True})
 
 
 @lru_cache(maxsize=64)
@@ -189,9 +248,9 @@ class FreeRunKernel:
     Attributes
     ----------
     start, read : ndarray
-        (nx,) and (N, m), to be filled before a call.
+        (nx,) and (N, m), to be filled before a call; `read` may be another array, contiguous.
     constants : list of ndarray
-        Likewise.
+        To be filled as well.
     """
 
     def __init__(self, step: ca.Function, samples: int) -> None:
@@ -203,12 +262,11 @@ class FreeRunKernel:
         self.read = self._read[:samples]
         self.constants = [np.zeros(step.size1_in(i)) for i in range(2, step.n_in())]
         self._step, self._loop = step, loop_of(step, 1)
-        self._given = (self.start, self._read, *self.constants)
 
     @cached_property
     def _interpreted(self) -> tuple[Any, Callable[[], None]]:
         buffer, trigger = along(self._step, 1, len(self._read), 1).buffer()
-        for i, argument in enumerate(self._given):
+        for i, argument in enumerate((self.start, self._read, *self.constants)):
             bind(buffer.set_arg, i, argument)
         return buffer, trigger
 
@@ -231,9 +289,10 @@ class FreeRunKernel:
         samples = len(self.read)
         if self._loop.pays(samples):
             out = self._states[:samples] if out is None else out
-            self._loop(samples, self._given, (out,))
+            self._loop(samples, (self.start, self.read, *self.constants), (out,))
             return out
         buffer, trigger = self._interpreted
+        self._read[:samples] = self.read
         self._read[samples:] = self._read[samples - 1]
         bind(buffer.set_res, 0, self._states)
         trigger()

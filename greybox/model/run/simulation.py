@@ -206,8 +206,11 @@ def simulate(
         angle = np.zeros((runs, samples + 1))
     if bound is None:
         bound = np.full(nx, 1e6)
-    outside = beyond(x, bound)
-    diverged = np.where(outside.any(axis=1), outside.argmax(axis=1), -1)
+    diverged = np.full(runs, -1)
+    # extremes of all states together are found sooner than which sample is outside
+    if not max(out.max(), -out.min()) <= min(bound):
+        outside = beyond(x, bound)
+        diverged = np.where(outside.any(axis=1), outside.argmax(axis=1), -1)
     return FreeRun(x, angle, diverged, np.asarray(bound, float))
 
 
@@ -264,7 +267,8 @@ def _few(
     kernel = FreeRunKernel(step.function, samples)
     kernel.constants[1][:] = sample_time
     for run in range(runs):
-        np.concatenate([part[run] for part in series], axis=1, out=kernel.read)
+        own = [part[run] for part in series]
+        kernel.read = np.concatenate(own, axis=1) if own[1:] else np.ascontiguousarray(own[0])
         kernel.start[:] = out[run, 0]
         kernel.constants[0][:] = theta[run]
         kernel(out[run, 1:])
