@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -19,10 +19,10 @@ from greybox.diagnosis.budget import (
     without_share,
 )
 from greybox.diagnosis.causes import Cause
+from greybox.diagnosis.causes.sensors import turned_alike
 from greybox.diagnosis.evidence.confusion import rivals
 from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.evidence.kinematics import denied
-from greybox.diagnosis.evidence.remainder import generic_force
 from greybox.diagnosis.evidence.standing import standing
 from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.fitting import Problem
@@ -44,13 +44,14 @@ from greybox.diagnosis.result import (
     finite,
 )
 from greybox.diagnosis.ruling import rule
-from greybox.diagnosis.search import Candidate, Search, Step, backwards, instead
+from greybox.diagnosis.search import Candidate, Search, backwards, instead
 from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.symptoms import find_symptoms
 from greybox.diagnosis.thresholds import WORTH
 from greybox.diagnosis.waves import Waves
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
+from greybox.numerics.linalg import scaled_inverse, sizes
 from greybox.numerics.parallel import map_forked
 from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
@@ -97,26 +98,28 @@ class DiagnosisBuilder:
             self.structure, problem, fit, self.case.logs, record, self.current, misfit
         )
 
-    def _misfit(self, fit: Fit) -> Array | float:
+    def _misfit(self, fit: Fit) -> Array:
         """Return the covariance (q, q) of the final fit's numbers by what a generic force moves.
 
-        With it the model's standard errors are those that are told of its causes.
+        With it the standard errors of a cause in the model are those that are told of it. The
+        other numbers come along as the logs ask for: moved alone, or together with a force that
+        the model does not have, they would be those of another ship.
         """
-        pairs = self.case.held_out(fit.integrator).pairs(fit)
-        bounded = [p for p in pairs if not (p.fit.escaped or p.held_fit.escaped)]
-        if not self.found.causes or not bounded:
-            return 0.0
-        moved = np.mean([generic_force(p).moved for p in bounded], axis=0)
-        out = np.outer(moved, moved)
         problem = self.case.problem(fit.integrator)
+        covariance = problem.covariance(fit)[1]
+        moved: dict[int, float] = {}
         for cause in self.found.causes:
-            if cause.standing is None or cause.told is not None:
-                # the fit holds those that stand already
-                continue
-            where = problem.numbers_of(fit.point, cause.hypothesis)
-            for i, by in zip(where, cause.standing.moved, strict=False):
-                out[i, i] = max(out[i, i], by**2)
-        return np.asarray(out)
+            # the fit holds those that stand already
+            if cause.standing is not None and cause.told is None:
+                where = problem.numbers_of(fit.point, cause.hypothesis)
+                moved |= zip(where, cause.standing.moved, strict=False)
+        mine = list(moved)
+        if not mine or not np.isfinite(covariance).all():
+            return np.zeros_like(covariance)
+        own = covariance[np.ix_(mine, mine)]
+        by = np.array(list(moved.values())) / sizes(own)
+        along = covariance[:, mine] @ scaled_inverse(own)
+        return np.asarray(along @ (own * np.outer(by, by)) @ along.T)
 
     @property
     def fit_told(self) -> Fit:
@@ -258,24 +261,41 @@ class DiagnosisBuilder:
         }
 
     def _groups(self) -> list[list[Candidate]]:
-        asked = [
-            step for step in self.found.steps
-            if step.taken is not None
-            and any(c.hypothesis.key == step.taken.hypothesis.key for c in self.found.causes)
-        ]  # fmt: skip
+        asked = [*self._asked()]
         self.case.held_out(self.found.final.integrator).contributions(self.found.final)
         # candidates hold functions, which no other process can send: the few groups are made here
-        many = map_forked(lambda step: len(self._group(step)) > 1, asked)
-        return [self._group(step) for step, several in zip(asked, many, strict=True) if several]
+        many = map_forked(lambda way: len(self._group(*way)) > 1, asked)
+        return [self._group(*way) for way, several in zip(asked, many, strict=True) if several]
 
-    def _group(self, step: Step) -> list[Candidate]:
-        """Return the cause that a step took, and the candidates that do as well in its place."""
-        causes, key = self.found.causes, step.taken.hypothesis.key if step.taken else ""
-        ids = {c.hypothesis.cause for c in causes}
-        best = next(c for c in step.candidates if c.hypothesis.key == key)
-        others = [c for c in step.candidates if c.hypothesis.cause not in ids]
-        without = step.before
-        if len(causes) > 1 or self.found.leaning:
+    def _asked(self) -> Iterator[tuple[Candidate, Sequence[Candidate], Fit | None]]:
+        """Yield causes, others that may do as well, and the fit that all of these began from.
+
+        None where they are to be fitted beside the remaining causes.
+        """
+        causes, taken = self.found.causes, set()
+        ids, keys = {c.hypothesis.cause for c in causes}, {c.hypothesis.key for c in causes}
+        alone = len(causes) == 1 and not self.found.leaning
+        for step in self.found.steps:
+            if step.taken is None or step.taken.hypothesis.key not in keys:
+                continue
+            taken.add(step.taken.hypothesis.key)
+            best = next(c for c in step.candidates if c.hypothesis.key == step.taken.hypothesis.key)
+            others = [c for c in step.candidates if c.hypothesis.cause not in ids]
+            yield best, others, step.before if alone else None
+        for cause in causes:
+            # those that the search began with, and what fell because they stand in its place
+            if cause.hypothesis.key not in taken:
+                like = [
+                    c for c in self.found.leaning if turned_alike(c.hypothesis, cause.hypothesis)
+                ]
+                if like:
+                    yield cause, like, None
+
+    def _group(
+        self, best: Candidate, others: Sequence[Candidate], without: Fit | None
+    ) -> list[Candidate]:
+        """Return a cause, and the candidates that do as well in its place."""
+        if without is None:
             without, best, others = instead(self.case, self.found.final, best, others)
         like = rivals(self.case.problem, self.case.held_out, best, others)
         like = [

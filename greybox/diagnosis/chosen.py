@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.causes.hull import is_coupling, term_parameters
 from greybox.diagnosis.causes.sensors import abeam
 from greybox.diagnosis.evidence.kinematics import denied
-from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.fitting import Problem, stacked
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.noise import Noise
 from greybox.diagnosis.null_model import INTEGRATORS, DiagnosisProblem
@@ -34,8 +34,10 @@ from greybox.errors import ExcitationError, GreyboxError
 from greybox.model.disturbances import TURNING
 from greybox.model.structure import Structure
 from greybox.model.terms import Term, parse_term
+from greybox.numerics.linalg import ROUNDING, scaled
 from greybox.numerics.parallel import ahead
 from greybox.selection.cross_validation import Refit
+from greybox.selection.free_run_selection import OWN
 from greybox.selection.term_selection import TermChoice, select_terms
 from greybox.trial.log import TrialLog
 from greybox.vessel.vessel import Vessel
@@ -178,15 +180,30 @@ def _start(
     """Return the chosen terms, those that stand for causes in force."""
     problem = case.problem(base.integrator)
     in_force = {n for a in named for n in (*a.columns, *a.co_freed)}
-    free = dict.fromkeys(
-        (*choice.terms.structure.parameters, *_replaced(ready.structure, named))
-    )  # fmt: skip
+    chosen = choice.terms.structure.parameters
+    free = dict.fromkeys((*chosen, *_replaced(ready.structure, named)))
     places = tuple(problem.place(n) for n in free if n not in in_force)
     start = Point(_ship(problem, choice, base), base.point.starts, places)
     for hypothesis in named:
         value = None if hypothesis.apply is None else np.array([_share(choice)])
         start = problem.add(start, hypothesis, value)
-    return start
+    spare = [problem.place(n) for n in free if n not in in_force and n not in chosen]
+    return _told_apart(problem, start, base.noise, spare)
+
+
+def _told_apart(problem: Problem, point: Point, noise: Noise, spare: Sequence[int]) -> Point:
+    """Return the point without spare terms that do what others do: u v and |u| v are one ahead."""
+    rows = stacked(problem.rows(point, noise))
+    while np.isfinite(rows).all():
+        normal, _ = scaled(rows.T @ rows)
+        own = 1 / np.diag(np.linalg.inv(normal + ROUNDING * np.eye(len(normal))))
+        shares = {i: share for i, share in zip(point.places, own, strict=False) if i in spare}
+        least = min(shares, key=lambda i: shares[i], default=-1)
+        if least < 0 or shares[least] >= OWN:
+            break
+        rows = np.delete(rows, point.places.index(least), axis=1)
+        point = replace(point, places=tuple(i for i in point.places if i != least))
+    return point
 
 
 def _bounded(case: DiagnosisProblem, starts: Sequence[Point], noise: Noise) -> list[Fit | None]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.linear import NOWHERE
 from greybox.diagnosis.noise import Noise, fit_noise, free_run_noise
-from greybox.diagnosis.normal import bounded_step, inverse
+from greybox.diagnosis.normal import bounded_step, inverses
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import CURRENTS, LogRun, Ship
 from greybox.diagnosis.thresholds import DECIDED
@@ -508,14 +508,15 @@ class Problem:
             return fit.point.vector()[:free], np.full((free, free), np.inf)
         lags = max(round(samples ** (1 / 3)), automatic_lags(nu))
         middle = bartlett_sums(scores, lags)
-        spread = inverse(normal)
+        # of columns that are alike only the sum is known, and scores tell nothing of the rest
+        spread, unknown = inverses(normal)
         robust = spread @ middle @ spread * samples / max(samples - q, 1)
         # rounding may leave nothing of a variance beside numbers that are hardly known
         lost = np.diag(robust) <= 0
         robust[lost], robust[:, lost] = 0.0, 0.0
         robust[lost, lost] = np.diag(spread)[lost]
         widen = np.sqrt(np.maximum(np.diag(spread) / np.maximum(np.diag(robust), 1e-300), 1.0))
-        full = robust * np.outer(widen, widen)
+        full = robust * np.outer(widen, widen) + unknown
         return fit.point.vector()[:free], full[:free, :free]
 
     def poles(self, point: Point) -> Array:

@@ -39,13 +39,22 @@ def bounded_step(normal: Array, gradient: Array, low: Array, high: Array, dampin
     return step
 
 
-def inverse(normal: Array) -> Array:
-    """Return the inverse (q, q); what nothing determines gets a spread beyond every other."""
+def inverses(normal: Array) -> tuple[Array, Array]:
+    """Return the inverse (q, q) in two parts that add up: of what is known, and of what is not.
+
+    What nothing determines gets a spread beyond every other.
+    """
     scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
     scale[scale == 0] = 1.0
     values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
-    values = np.maximum(values, _UNKNOWN * max(values[-1], 1e-300))
-    return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))
+    least = _UNKNOWN * max(values[-1], 1e-300)
+    known = values > least
+    parts = (
+        (vectors[:, mine] / np.maximum(values[mine], least)) @ vectors[:, mine].T
+        for mine in (known, ~known)
+    )
+    one, two = (part / np.outer(scale, scale) for part in parts)
+    return one, two
 
 
 def _solve(normal: Array, right: Array, damping: float) -> Array:

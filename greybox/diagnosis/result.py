@@ -351,6 +351,8 @@ class Diagnosis(DisplayMixin):
     def headline(self) -> str:
         """The verdict in one sentence."""
         told = "; ".join(f"{c.title}: {c.evidence}" for c in self.causes) + "."
+        for group in self.groups:
+            told += f" Beside that these logs cannot tell {' from '.join(group)}."
         if self.verdict == DiagnosisVerdict.NAMED:
             return told
         if self.verdict == DiagnosisVerdict.PARTLY:

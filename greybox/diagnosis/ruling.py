@@ -92,7 +92,9 @@ def rule(
         That the logs were sailed in: what they move is nothing that the model should do.
     """
     final, stand, leaning, notes = found.final, found.causes, found.leaning, []
-    if final is not found.base and sum(g.after - g.before for g in gain.values()) < 0:
+    # a run that is worse than a constant predicts nothing, however much worse it is
+    better = sum(max(g.after, 0.0) - max(g.before, 0.0) for g in gain.values())
+    if final is not found.base and better < 0:
         # likelier errors are no better simulation: nothing is extended by them
         helped = ", ".join(c.hypothesis.id for c in stand) or "terms that the data chose"
         notes.append(
@@ -304,7 +306,7 @@ def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str, kept:
             f"Forces that belong to no known cause would explain another {share} "
             f"(p = {left.proof.p_value:.1g}): too little to change the verdict.{tail}"
         )
-    return f"What is left cannot be told from {'gusts' if missed else 'noise'}.{tail}"
+    return f"What is left cannot be told from {'gusts' if missed or moved else 'noise'}.{tail}"
 
 
 def _next(

@@ -51,7 +51,7 @@ _AHEAD = 3
 # iterations of a first fit, and the share of the error below which a step ends it
 _FIRST, _SETTLED = 12, 3e-3
 # share of the squared error that a term must take away, and that its own direction must hold
-_EARNS, _OWN = 4e-3, 1e-3
+_EARNS, OWN = 4e-3, 1e-3
 # gain by which a term that may drive the ship must exceed that of one that only takes energy out:
 # u r and |u| r are one on logs ahead, and astern the one drives what the other brakes
 _BRAKES = 1.25
@@ -392,7 +392,7 @@ class FreeRunSelection:
         own = np.diag(hessian)[out]
         left = own - np.einsum("ij,jk,ik->i", cross, inverse, cross)
         slope = gradient[out] - cross @ (inverse @ gradient[index])
-        known = left > _OWN * np.maximum(own, 0.0)
+        known = left > OWN * np.maximum(own, 0.0)
         least, most = self._least[out], self._most[out]
         known &= np.where(slope > 0, most > 0, least < 0)
         gains = np.where(known, 0.5 * slope**2 / np.where(known, left, 1.0), 0.0)

@@ -123,6 +123,14 @@ def alike_to_forces(one: Hypothesis, two: Hypothesis) -> bool:
     )
 
 
+def turned_alike(one: Hypothesis, two: Hypothesis) -> bool:
+    """Whether one turns surge into sway as the other's force does, a compass bias or a force."""
+    return any(
+        turned.cause == "heading_bias" and other.cause in ("asymmetry", "side_force")
+        for turned, other in ((one, two), (two, one))
+    )
+
+
 class ClockOffset(Cause):
     """One sensor shows an older time than the others."""
 

@@ -19,6 +19,7 @@ from greybox.diagnosis.evidence.remainder import (
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit, Point
+from greybox.diagnosis.scores import MOMENTS
 from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.thresholds import (
     AS_CHOSEN,
@@ -61,7 +62,9 @@ class Standing:
     level : float
         Significance that a gain on held-out logs must have.
     tried : int
-        Causes that were scored, of which this is one.
+        Causes that were scored, of which this is one, each as often as a moment was sought for it.
+    sought : bool
+        Whether it is the best of many moments.
     """
 
     beyond: Proof
@@ -72,6 +75,7 @@ class Standing:
     told: float
     level: float = PROVEN
     tried: int = 1
+    sought: bool = False
 
     @property
     def stands(self) -> bool:
@@ -83,9 +87,9 @@ class Standing:
     @property
     def _sure(self) -> bool:
         """Whether one of its numbers is known well enough."""
-        if np.isinf(self.beyond.gain):
-            # many a cause keeps a run within bounds: its number alone speaks for it, and was the
-            # best of all that were tried
+        if self.sought or np.isinf(self.beyond.gain):
+            # many a cause keeps a run within bounds, and many a moment follows a misfit: its number
+            # alone speaks for it, and was the best of all that were tried
             return self.tried * self.told < SIGNIFICANT
         # what heading, time or earlier commands do has no share of such a force to show for it
         return self.told < (PROVEN if self.share is None else SAME)
@@ -108,10 +112,12 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
     """
     moved, clear, told = _moved(problem, hypothesis, with_it, pairs)
     level = level_of(with_it)
+    sought = any(p.reach > 0 for p in hypothesis.parameters)
+    tried *= MOMENTS if sought else 1
     if any(p.held_fit.escaped or p.fit.escaped for p in (*pairs, *without)):
         better = not any(p.held_fit.escaped for p in pairs)
         proof = proof_of(np.array([np.inf if better else -np.inf]))
-        return Standing(proof, None, 1.0, moved, clear, told, level, tried)
+        return Standing(proof, None, 1.0, moved, clear, told, level, tried, sought)
     use = _own_arguments(problem, hypothesis)
     for pair in without:
         fit_generic_forces(pair, [MOTION_AND_COMMANDS, *([] if use is None else [use])])
@@ -126,7 +132,7 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
         gained, could = plain - own, plain - generic
         share = float(gained.sum() / could.sum()) if could.sum() > 0 else np.inf
         half = proof_of(gained - LEAST_SHARE * could).p_value
-    return Standing(beyond, share, half, moved, clear, told, level, tried)
+    return Standing(beyond, share, half, moved, clear, told, level, tried, sought)
 
 
 def level_of(fit: Fit) -> float:
