@@ -211,8 +211,8 @@ class _Fit:
         self.c, self.x, self.omega = c, x, omega
         total = c + np.diag(omega)
         self.weights = np.linalg.inv(total)
-        self._xw = np.einsum("kjq,kjl->kql", x, self.weights)
-        gram = np.einsum("kql,klr->qr", self._xw, x)
+        self._xw = x.transpose(0, 2, 1) @ self.weights
+        gram = np.tensordot(self._xw, x, ((0, 2), (0, 1)))
         self.beta_covariance = np.linalg.inv(gram)
         self.beta = self.beta_covariance @ np.einsum("kql,kl->q", self._xw, y)
         self.residual = y - x @ self.beta
@@ -226,13 +226,13 @@ class _Fit:
     def slope(self) -> Array:
         """Return the slope of the restricted log-likelihood in each ω, (p,)."""
         own = np.diagonal(self.weights, axis1=1, axis2=2)
-        shared = np.einsum("kqj,qr,krj->kj", self._xw, self.beta_covariance, self._xw)
+        shared = ((self.beta_covariance @ self._xw) * self._xw).sum(axis=1)
         return np.asarray(0.5 * ((self.score**2) - own + shared).sum(axis=0))
 
     def information(self) -> Array:
         """Return the restricted information of the ω, (p, p): Harville (1977)."""
         w, b = self.weights, self.beta_covariance
-        shared = np.einsum("kqj,qr,krl->kjl", self._xw, b, self._xw)
+        shared = self._xw.transpose(0, 2, 1) @ b @ self._xw
         # Σ over pairs of units of (W_i X_i B X_hᵀ W_h)²_jl, from sums over each unit
         moments = np.einsum("kqj,krj->jqr", self._xw, self._xw) @ b
         pairs = np.einsum("jqr,lrq->jl", moments, moments)
