@@ -132,7 +132,10 @@ class DiagnosisBuilder:
         quantities = quantities_of(self.case.problem(fit.integrator), candidate, fit)
         told = {k: (q.value, q.std) for k, q in quantities.items()}
         evidence = cause.evidence_of(candidate.hypothesis, told)
-        if self.case.metric == "free run" and not denied("lever_arm", self.agreeing):
+        if candidate.hypothesis.cause == "current":
+            if not all(log.has_wind for log in self.case.logs):
+                evidence += ", or in a steady wind that was not measured"
+        elif self.case.metric == "free run" and not denied("lever_arm", self.agreeing):
             evidence += _or_alike(candidate.hypothesis)
         return Found(
             candidate.hypothesis.id, candidate.hypothesis.key, cause.title, quantities,

@@ -9,6 +9,7 @@ the choice of terms, too.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from collections.abc import Set as AbstractSet
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -121,6 +122,11 @@ def from_chosen(
     every: list[Hypothesis] = []
     if choice is not None:
         chosen, every = _hypotheses(ready, case, choice)
+        known = _known_columns(case.problem(base.integrator), base, chosen)
+        chosen, every = (
+            [_less(a, known) for a in some if not a.columns or set(a.columns) - known]
+            for some in (chosen, every)
+        )
         starts.append(_holding(case, _start(ready, case, choice, chosen, base), late))
     fit, *rest = _bounded(case, starts, plain.noise)
     by_data = rest[0] if rest else None
@@ -138,7 +144,10 @@ def from_chosen(
         abeam(a) if coupled and a.cause == "lever_arm" else a for a in hypotheses if a not in named
     ]
     other = search(case, fit, others, begun=[*causes, *late], progress=progress)
-    mine = replace(other, base=base, tried=len(hypotheses), chosen=by_data)
+    # as near to the logs as (3.51) can be: a colour may have taken a slow misfit for the sea's own
+    mine = replace(
+        other, base=base if plain.escaped else plain, tried=len(hypotheses), chosen=by_data
+    )  # fmt: skip
     return (case, mine) if _nearer(case, mine.final, case.carried(found.final)) else None
 
 
@@ -191,19 +200,56 @@ def _start(
     return _told_apart(problem, start, base.noise, spare)
 
 
+def _known_columns(problem: Problem, base: Fit, named: Sequence[Hypothesis]) -> set[str]:
+    """Return columns of causes that (3.51) can do as well on these logs: |X| u is X u ahead."""
+    point = base.point
+    for hypothesis in named:
+        if hypothesis.apply is None:
+            point = problem.add(point, hypothesis)
+    normal = _normal(problem, point, base.noise)
+    more = range(len(base.point.places), len(point.places))
+    begun = [k for k in range(len(normal)) if k not in more]
+    return {
+        problem.names[point.places[k]]
+        for k in more
+        if len(normal) and _own_share(normal, [*begun, k], k) < OWN
+    }
+
+
+def _less(hypothesis: Hypothesis, known: AbstractSet[str]) -> Hypothesis:
+    """Return a cause without the columns that are known."""
+    if not known & set(hypothesis.columns):
+        return hypothesis
+    left = [k for k, name in enumerate(hypothesis.columns) if name not in known]
+    columns = tuple(hypothesis.columns[k] for k in left)
+    return replace(
+        hypothesis, key=f"{hypothesis.cause}:{'+'.join(columns)}", columns=columns,
+        parameters=tuple(hypothesis.parameters[k] for k in left),
+    )  # fmt: skip
+
+
 def _told_apart(problem: Problem, point: Point, noise: Noise, spare: Sequence[int]) -> Point:
     """Return the point without spare terms that do what others do: u v and |u| v are one ahead."""
+    normal = _normal(problem, point, noise)
+    kept = list(range(len(normal)))
+    for i in spare:
+        k = point.places.index(i)
+        if kept and _own_share(normal, kept, k) < OWN:
+            kept.remove(k)
+    places = tuple(i for k, i in enumerate(point.places) if not kept or k in kept)
+    return replace(point, places=places)
+
+
+def _normal(problem: Problem, point: Point, noise: Noise) -> Array:
+    """Return products of what each free number does, in its own size; none without bounds."""
     rows = stacked(problem.rows(point, noise))
-    while np.isfinite(rows).all():
-        normal, _ = scaled(rows.T @ rows)
-        own = 1 / np.diag(np.linalg.inv(normal + ROUNDING * np.eye(len(normal))))
-        shares = {i: share for i, share in zip(point.places, own, strict=False) if i in spare}
-        least = min(shares, key=lambda i: shares[i], default=-1)
-        if least < 0 or shares[least] >= OWN:
-            break
-        rows = np.delete(rows, point.places.index(least), axis=1)
-        point = replace(point, places=tuple(i for i in point.places if i != least))
-    return point
+    return scaled(rows.T @ rows)[0] if np.isfinite(rows).all() else np.zeros((0, 0))
+
+
+def _own_share(normal: Array, among: Sequence[int], one: int) -> float:
+    """Return what of one number's effect no other one among several has, squared."""
+    part = normal[np.ix_(among, among)] + ROUNDING * np.eye(len(among))
+    return float(1 / np.linalg.inv(part)[among.index(one), among.index(one)])
 
 
 def _bounded(case: DiagnosisProblem, starts: Sequence[Point], noise: Noise) -> list[Fit | None]:

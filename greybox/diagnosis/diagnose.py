@@ -196,10 +196,16 @@ def diagnose(
     if model is not None:
         conditions = (*conditions, *other_conditions(model.conditions, case.logs))
     notes += [d.sentence for d in conditions]
+    causes = causes_of(ready.findings, ready.causes, ready.tried)
+    if causes:
+        notes.append(
+            f"{', '.join(dict.fromkeys(c.id for c in causes))}: sensors show it among themselves, "
+            f"and the logs were corrected before any model was fitted, so no share of the error "
+            f"and no gain is told of it."
+        )
     report = DiagnosisBuilder(
         case, ready.structure, ready.causes, found, model, options.seed, notes, ready.agreeing
     )
-    causes = causes_of(ready.findings, ready.causes, ready.tried)
     if lines[1] is not None and "waves" in ready.causes:
         causes.append(found_waves(lines[1], ready.causes["waves"], ready.tried))
     made = report.made(causes, ready.validate, ready.tried, lines)

@@ -519,6 +519,37 @@ class Problem:
         full = robust * np.outer(widen, widen) + unknown
         return fit.point.vector()[:free], full[:free, :free]
 
+    def effect(self, fit: Fit, hypothesis: Hypothesis) -> tuple[Array, Array, Array]:
+        """Return how far a hypothesis is from its null, how surely, and what moves it.
+
+        Numbers with many hills have no null, and are left out.
+
+        Returns
+        -------
+        tuple of ndarray
+            (k,) numbers less their null, (k, k) their covariance, and (k, q) derivatives in the
+            free numbers but the starts.
+        """
+        point = fit.point
+        where = self.numbers_of(point, hypothesis)
+        free = len(point.places) + sum(map(len, point.values))
+        away, along = point.vector()[where], np.eye(free)[where]
+        if hypothesis.apply is not None:
+            away = away - [p.null for p in hypothesis.parameters]
+            tested = [p.reach == 0 for p in hypothesis.parameters]
+        if hypothesis.multiplied:
+            place = self.place(hypothesis.multiplied)
+            along[0] *= point.base.theta[place]
+            if place in point.places:
+                along[0, point.places.index(place)] = away[0]
+            away[0] *= point.base.theta[place]
+        if hypothesis.apply is not None:
+            away, along = away[tested], along[tested]
+        covariance = self.covariance(fit)[1]
+        if not np.isfinite(covariance).all():
+            return away, np.full((len(away),) * 2, np.inf), along
+        return away, along @ covariance @ along.T, along
+
     def poles(self, point: Point) -> Array:
         """Return what is left of each channel's own error after a sample, on average."""
         ship = point.ship

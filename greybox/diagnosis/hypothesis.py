@@ -94,6 +94,9 @@ class Hypothesis:
     refit_from_scratch : bool
         Whether the coefficients must be sought anew: what it changes is too much for
         derivatives.
+    multiplied : str
+        Coefficient that its first number multiplies: what is tested is by how much that changes,
+        which is known where it is told from another one less surely than its sum with that.
     place : str
         What of the vessel it is of alone, such as the column of one command, where no name of its
         parameters tells it.
@@ -117,6 +120,7 @@ class Hypothesis:
     arguments: tuple[str, ...] = ()
     parity: int = 0
     refit_from_scratch: bool = False
+    multiplied: str = ""
     place: str = ""
     unit: str = ""
     only: bool = False

@@ -395,7 +395,8 @@ class Diagnosis(DisplayMixin):
 
     def summary(self) -> str:
         """Return the diagnosis as text."""
-        lines = [f"verdict: {self.verdict}", self.headline, "", "What the simulation gets wrong:"]
+        where = "What the simulation gets wrong (estimation logs):"
+        lines = [f"verdict: {self.verdict}", self.headline, "", where]
         lines += [f"  {s.sentence}" for s in self.wrong] or ["  nothing beyond noise"]
         lines += [f"  {t.sentence}" for t in self.residuals.get("before", ()) if not t.passed]
         for title, causes in (

@@ -387,21 +387,11 @@ def _wald_checked(case: DiagnosisProblem, candidate: Candidate) -> Candidate:
 
     hypothesis, fit = candidate.hypothesis, candidate.fit
     problem = case.problem(fit.integrator)
-    where = problem.numbers_of(fit.point, hypothesis)
-    if hypothesis.apply is None:
-        null = [0.0] * len(where)
-    else:
-        tested = [
-            (k, p.null) for k, p in zip(where, hypothesis.parameters, strict=True) if not p.reach
-        ]
-        where, null = [k for k, _ in tested], [value for _, value in tested]
-    if not where:
+    away, own, _ = problem.effect(fit, hypothesis)
+    if not len(away):
         return candidate
-    numbers, covariance = problem.covariance(fit)
-    own = covariance[np.ix_(where, where)]
-    away = numbers[where] - null
     wald = float(away @ np.linalg.pinv(own) @ away) if np.isfinite(own).all() else 0.0
-    p = max(candidate.p_value, float(chdtrc(len(where), wald)))
+    p = max(candidate.p_value, float(chdtrc(len(away), wald)))
     return replace(candidate, p_value=p, p_adjusted=min(1.0, p * candidate.tried))
 
 

@@ -8,8 +8,8 @@ from math import factorial
 import numpy as np
 import pytest
 
-from greybox.diagnosis.causes.sensors import LeverArm, abeam, alike_to_forces
-from greybox.diagnosis.chosen import _with_sensors
+from greybox.diagnosis.causes.sensors import LeverArm, abeam, alike_to_forces, turned_alike
+from greybox.diagnosis.chosen import _known_columns, _own_share, _told_apart, _with_sensors
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.search import Candidate, _of_the_ship
@@ -104,3 +104,36 @@ def test_only_the_place_abeam_of_an_antenna_is_sought_beside_coupled_inertia() -
     assert not alike_to_forces(coupling, coupling)
     said = LeverArm().evidence({"lever_arm_y": (-2.0, 0.1)})
     assert said == "the velocities are those of a point 2.00 ± 0.10 m to port of the origin"
+
+
+def test_terms_that_logs_cannot_tell_apart_are_free_once() -> None:
+    square = np.array([[1.0, 1.0, 0.2], [1.0, 1.0, 0.2], [0.2, 0.2, 1.0]])
+    assert _own_share(square, [0, 1, 2], 1) < 1e-9
+    assert _own_share(square, [0, 2], 0) == pytest.approx(1 - 0.2**2)
+    # a ship that only goes ahead: |u| u is u u
+    trial = draw(np.random.default_rng([4, 2]), (), samples=200, positions=False)
+    assert (trial.estimation["u"] > 0).all()
+    ready = prepare([trial.estimation], [trial.validation], None, "thesis", ["crossflow"])
+    case = ready.case.wider(["N_|u|v", "N_|v|v"], "free run")
+    base = case.carried(ready.base())
+    problem = case.problem(base.integrator)
+
+    def damping(name: str) -> Hypothesis:
+        return Hypothesis("crossflow", f"crossflow:{name}", (Parameter(name, "1/m", 0.0),), (name,))
+
+    # and (3.51) has u v
+    assert _known_columns(problem, base, [damping("N_|u|v"), damping("Y_|r|v")]) == {"N_|u|v"}
+    both = problem.add(base.point, damping("N_|u|v"))
+    own = problem.place("Nuv")
+    assert set(both.places) - set(_told_apart(problem, both, base.noise, [own]).places) == {own}
+    assert _told_apart(problem, base.point, base.noise, [own]).places == base.point.places
+
+
+def test_a_compass_bias_and_a_force_to_one_side_are_rivals() -> None:
+    def of(cause: str) -> Hypothesis:
+        return Hypothesis(cause, cause, ())
+
+    assert turned_alike(of("heading_bias"), of("asymmetry"))
+    assert turned_alike(of("side_force"), of("heading_bias"))
+    assert not turned_alike(of("asymmetry"), of("side_force"))
+    assert not turned_alike(of("heading_bias"), of("lever_arm"))

@@ -455,3 +455,32 @@ def test_what_was_not_measured_counts_nowhere(log: TrialLog) -> None:
     _, _, before = directions.alone([columns])
     np.testing.assert_allclose(before, (white[0] ** 2).sum(axis=(0, 1)), rtol=1e-12)
     assert sum(known.sum() for known in fit.known) == 4 * len(log) - 100
+
+
+def test_a_change_is_tested_by_what_it_changes() -> None:
+    """A coefficient that hardly differs from another is not known, nor is its factor."""
+    theta, factor = -2.0, 1.5
+    change = (factor - 1) * theta
+    # of the coefficient (1), and of what it changes by (0.01)
+    turned = np.array([[1.0, 0.0], [-change / theta**2, 1 / theta]])
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = turned @ np.diag([1.0, 1e-4]) @ turned.T
+    covariance[2, 2] = 4.0
+    trial = draw(np.random.default_rng([4, 2]), (), samples=60)
+    problem = Problem([LogRun(get_structure("thesis"), trial.estimation, "rk4")])
+    place = problem.place("Xuu")
+    factors = (
+        Parameter("Xuu_factor", "1", 1.0, null=1.0), Parameter("Xuu_time", "s", 0.0, reach=5.0)
+    )  # fmt: skip
+    hypothesis = Hypothesis(
+        "parameter_change", "c", factors, (), lambda ship, _: ship, multiplied="Xuu"
+    )
+    known = np.zeros(len(problem.structure.parameters))
+    known[place] = theta
+    ship = Ship(known, np.zeros(2), trial.estimation.vessel)
+    point = Point(ship, (), (place,), (hypothesis,), (np.array([factor, 30.0]),))
+    fit = Fit(point, Noise((), ()), 0.0, (), (), True, "rk4", ())
+    problem._covariances.append((fit, (point.vector(), covariance)))
+    away, own, _ = problem.effect(fit, hypothesis)
+    np.testing.assert_allclose(away, [change])
+    np.testing.assert_allclose(own, [[1e-4]])

@@ -248,6 +248,15 @@ def test_what_the_clocks_lack_is_said(gone, status, said, ship):
     assert said in clock.sentence
 
 
+def test_of_two_clocks_by_themselves_one_is_late_and_none_is_early(ship):
+    d = recorded(0, 2.0, seconds=300.0, wide=True, late={"psi": 1.0})
+    (found,) = check_recording(as_recording({n: d[n] for n in ("t", "psi", "r")}), ship).findings
+    assert (found.channels, found.mends[0].late) == (("psi",), found.value)
+    assert abs(found.value - 1.0) < 0.1
+    assert "psi comes" in found.evidence
+    assert "late against the rate" in found.evidence
+
+
 def test_without_a_course_heading_and_rate_are_both_in_doubt(ship):
     d = negate(recorded(0, 2.0, seconds=300.0, wide=True), "r")
     d = {n: v for n, v in d.items() if n in ("t", "psi", "r")}

@@ -49,7 +49,11 @@ class ParameterChange(Cause):
                     reach=_REACH * context.duration,
                 ),
             )  # fmt: skip
-            out.append(Hypothesis(self.id, f"{self.id}:{term.name}", parameters, (), apply))
+            out.append(
+                Hypothesis(
+                    self.id, f"{self.id}:{term.name}", parameters, (), apply, multiplied=term.name
+                )
+            )  # fmt: skip
         return out
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:

@@ -150,28 +150,24 @@ def _moved(
     bounded = [p for p in pairs if not (p.fit.escaped or p.held_fit.escaped)]
     if not where or not bounded:
         return np.zeros(len(where)), 0.0, 0.0
-    moved = np.mean([generic_force(p).moved[where] for p in bounded], axis=0)
+    every = np.mean([generic_force(p).moved for p in bounded], axis=0)
     scatter = np.sqrt(np.mean([_scatter(p, hypothesis) for p in bounded], axis=0))
-    numbers, covariance = problem.covariance(fit)
-    own = covariance[np.ix_(where, where)]
-    null = np.zeros(len(where))
-    tested, coarse = np.ones(len(where), bool), np.zeros(len(where))
+    whole = np.hypot(every[where], scatter)
+    away, own, along = problem.effect(fit, hypothesis)
+    if not np.isfinite(own).all() or not len(away):
+        return whole, *[1.0 if len(away) else 0.0] * 2
+    coarse = np.zeros(len(where))
     if hypothesis.apply is not None:
-        null, coarse = np.array([(p.null, p.coarse) for p in hypothesis.parameters]).T
-        # a number with many hills has no null
-        tested = np.array([p.reach == 0 for p in hypothesis.parameters])
-    if not np.isfinite(own).all() or not tested.any():
-        return np.hypot(moved, scatter), *[1.0 if tested.any() else 0.0] * 2
-    away, far = (numbers[where] - null)[tested], moved[tested]
-    inverse = np.linalg.pinv(own[np.ix_(tested, tested)])
+        coarse = np.array([p.coarse for p in hypothesis.parameters])
+    far, apart = along @ every, along[:, where] @ np.diag(np.hypot(scatter, coarse))
+    inverse = np.linalg.pinv(own)
     # the null must not lie on the way, either
     size = float(far @ inverse @ far)
     share = float(np.clip(-(away @ inverse @ far) / size, 0.0, 1.0)) if size > 0 else 0.0
     near = away + share * far
-    passed = float(chdtrc(int(tested.sum()), float(near @ inverse @ near)))
-    more = far**2 + scatter[tested] ** 2 + coarse[tested] ** 2
-    told = away**2 / np.maximum(np.diag(own)[tested] + more, 1e-300)
-    return np.hypot(moved, scatter), passed, float(chdtrc(1, told.max()))
+    passed = float(chdtrc(len(away), float(near @ inverse @ near)))
+    told = away**2 / np.maximum(np.diag(own) + far**2 + (apart**2).sum(axis=1), 1e-300)
+    return whole, passed, float(chdtrc(1, told.max()))
 
 
 def _scatter(pair: Pair, hypothesis: Hypothesis) -> Array:

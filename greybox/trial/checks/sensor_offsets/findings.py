@@ -164,9 +164,13 @@ def _clock_finding(d: Defect, base: _Base, campaign: Campaign) -> Finding:
     channels, against = d.channels, d.against
     late = value - base.late
     moved = channels
-    if "x_n" in channels and value < 0:
-        # a sensor can be late, not early: then all the others are
+    # a sensor can be late, not early: then all the others are
+    if value < 0 and "x_n" in channels:
         channels, against, value = against, channels, -value
+    elif value < 0 and (channels, against) == (("r",), ("psi",)):
+        # two by themselves
+        channels, against, value = against, channels, -value
+        moved, late = channels, value - base.late
     if base.channels and "x_n" in d.channels:
         # the positions stand on the inputs' clock: the others are moved to it
         moved, late = d.against, -base.late
