@@ -10,6 +10,7 @@ from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import Quantity
 from greybox.diagnosis.search import Candidate
 from greybox.diagnosis.ship import CURRENTS
+from greybox.model.terms import parameter_unit, parse_term
 from greybox.rotation import ned_to_body
 
 Array = NDArray[np.float64]
@@ -50,7 +51,7 @@ def quantities_of(problem: Problem, candidate: Candidate, fit: Fit) -> dict[str,
     wide = problem.spread(fit, hypothesis)
     # what a generic force would move a number by is a part of what is not known of it
     moved = np.zeros(len(index)) if weighed is None else weighed.moved[: len(index)]
-    return {
+    found = {
         p.name: Quantity(
             *p.told(
                 float(values[i]),
@@ -60,3 +61,20 @@ def quantities_of(problem: Problem, candidate: Candidate, fit: Fit) -> dict[str,
         )
         for p, i, by in zip(hypothesis.parameters, index, moved, strict=True)
     }
+    if hypothesis.multiplied:
+        found |= _change(problem, candidate, fit)
+    return found
+
+
+def _change(problem: Problem, candidate: Candidate, fit: Fit) -> dict[str, Quantity]:
+    """Return by how much a coefficient changes: its factor may be known far less surely."""
+    from scipy.special import chdtri
+
+    name = candidate.hypothesis.multiplied
+    away, own, _ = problem.effect(fit, candidate.hypothesis)
+    std = float(np.sqrt(max(own[0, 0], 0.0)))
+    if candidate.standing is not None:
+        # with what a generic force moves it by
+        std = max(std, abs(away[0]) / np.sqrt(chdtri(1, max(candidate.standing.told, 1e-300))))
+    unit = parameter_unit(parse_term(name), problem.runs[0].log.vessel.force_unit)
+    return {f"{name}_change": Quantity(float(away[0]), std, unit)}

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.ship import Change, Ship
+from greybox.notebook import with_error
 
 Array = NDArray[np.float64]
 
@@ -58,8 +59,9 @@ class ParameterChange(Cause):
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say which, when and how much."""
-        (name, (factor, _)), (_, (time, std)) = list(values.items())[:2]
+        (name, (factor, _)), (_, (time, std)), *rest = values.items()
+        by = "".join(f"changes by {with_error(*change)}, and " for _, change in rest)
         return (
-            f"{name.removesuffix('_factor')} is {factor:.2f} times its value from {time:.0f} ± "
+            f"{name.removesuffix('_factor')} {by}is {factor:.2f} times its value from {time:.0f} ± "
             f"{max(std, 1):.0f} s on"
         )
