@@ -144,9 +144,9 @@ def from_chosen(
         abeam(a) if coupled and a.cause == "lever_arm" else a for a in hypotheses if a not in named
     ]
     other = search(case, fit, others, begun=[*causes, *late], progress=progress)
-    # as near to the logs as (3.51) can be: a colour may have taken a slow misfit for the sea's own
     mine = replace(
-        other, base=base if plain.escaped else plain, tried=len(hypotheses), chosen=by_data
+        other, base=base, tried=len(hypotheses), chosen=by_data,
+        nearest=None if plain.escaped else plain,
     )  # fmt: skip
     return (case, mine) if _nearer(case, mine.final, case.carried(found.final)) else None
 

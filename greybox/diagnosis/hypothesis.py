@@ -91,6 +91,9 @@ class Hypothesis:
     parity : {0, 1, -1}
         Whether the force of a hypothesis with `arguments` keeps the ship's symmetry of port and
         starboard where its thruster does (1), breaks it (-1), or has parts of both (0).
+    far : tuple of tuple of float
+        Values so far off that other coefficients are likely there: those of least squares are a
+        start at the likeliest.
     refit_from_scratch : bool
         Whether the coefficients must be sought anew: what it changes is too much for
         derivatives.
@@ -119,6 +122,7 @@ class Hypothesis:
     co_freed: tuple[str, ...] = ()
     arguments: tuple[str, ...] = ()
     parity: int = 0
+    far: tuple[tuple[float, ...], ...] = ()
     refit_from_scratch: bool = False
     multiplied: str = ""
     place: str = ""

@@ -298,20 +298,9 @@ class DiagnosisProblem:
         own = {self.problem(fit.integrator).place(n) for n in self.structure.parameters}
         if self._near(fit) or not own <= set(fit.point.places):
             return fit
-        logs = [_as_it_should_be(log, fit.point.ship) for log in self.logs]
-        first = rough(self.structure, logs, self.kind, self.regime)[0]
-        problem = self.problem(fit.integrator)
-        base = fit.point.base
-        theta = np.array(
-            [first.get(n, base.theta[i]) for i, n in enumerate(self.universe.parameters)]
-        )
-        point = replace(fit.point, base=replace(base, theta=theta))
-        errors = problem.errors(point)
-        if not all(np.isfinite(e).all() for e in errors):
-            return fit
-        noise = problem.noise_of(errors, point)
-        found = problem.settle(problem.fit(point, noise), 3)
-        return found if found.cost < fit.cost - _BETTER else fit
+        first, _ = self._least_squares(fit.point)
+        found = self._refitted(fit.point, fit.integrator, first)
+        return found if found is not None and found.cost < fit.cost - _BETTER else fit
 
     def other_integrator(self, fit: Fit) -> Fit:
         """Return the fit with the other integrator, if that is likelier."""
@@ -360,9 +349,8 @@ class DiagnosisProblem:
         level = rough(self.structure, self.logs, self.kind, self.regime)[1]
         ranked: list[tuple[float, Hypothesis, Mapping[str, float]]] = []
         for hypothesis in (*asked, *moved):
-            ship = self.problem(fit.integrator).add(fit.point, hypothesis).ship
-            logs = [_as_it_should_be(log, ship) for log in self.logs]
-            values, own = rough(self.structure, logs, self.kind, self.regime)
+            point = self.problem(fit.integrator).add(fit.point, hypothesis)
+            values, own = self._least_squares(point)
             if level - own >= _REWIRED:
                 ranked.append((own, hypothesis, values))
         ranked.sort(key=lambda item: item[0])
@@ -378,6 +366,54 @@ class DiagnosisProblem:
             if bounded:
                 out.append((hypothesis, min(bounded, key=lambda f: f.cost)))
         return out
+
+    def from_far(self, fit: Fit, hypotheses: Sequence[Hypothesis]) -> list[tuple[Hypothesis, Fit]]:
+        """Return fits from far values of hypotheses, with the coefficients of least squares there.
+
+        Only where their one-step errors are clearly smaller than with those of the fit.
+
+        Parameters
+        ----------
+        fit : Fit
+            Without any of the hypotheses.
+        hypotheses : sequence of Hypothesis
+            Of which those count that have far values.
+        """
+        problem, out = self.problem(fit.integrator), []
+        asked = [a for a in hypotheses if a.far]
+        level = self._least_squares(fit.point)[1] if asked else 0.0
+        for hypothesis in asked:
+            ways = [problem.add(fit.point, hypothesis, np.array(value)) for value in hypothesis.far]
+            found = [self._least_squares(point) for point in ways]
+            best = int(np.argmin([own for _, own in found]))
+            if level - found[best][1] < _REWIRED:
+                continue
+            begun = self._refitted(ways[best], fit.integrator, found[best][0])
+            if begun is not None and not begun.escaped:
+                out.append((hypothesis, begun))
+        return out
+
+    def _least_squares(self, point: Point) -> tuple[dict[str, float], float]:
+        """Return `rough` of the free terms on logs as they would be without what a point knows."""
+        free = {self.universe.parameters[i] for i in point.places if i < len(point.base.theta)}
+        terms = tuple(t for t in self.universe.terms if t.name in free)
+        logs = [_as_it_should_be(log, point.ship) for log in self.logs]
+        return rough(replace(self.universe, terms=terms), logs, self.kind, self.regime)
+
+    def _refitted(
+        self, point: Point, integrator: Integrator, first: Mapping[str, float]
+    ) -> Fit | None:
+        """Return the fit from other coefficients; None where their runs leave every bound."""
+        problem, base = self.problem(integrator), point.base
+        theta = np.array(
+            [first.get(n, base.theta[i]) for i, n in enumerate(self.universe.parameters)]
+        )
+        point = replace(point, base=replace(base, theta=theta))
+        errors = problem.errors(point)
+        if not all(np.isfinite(e).all() for e in errors):
+            return None
+        found = problem.settle(problem.fit(point, problem.noise_of(errors, point)), 3)
+        return replace(found, integrator=integrator)
 
 
 def _as_it_should_be(log: TrialLog, ship: Ship) -> TrialLog:

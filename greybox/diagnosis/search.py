@@ -163,6 +163,9 @@ class Search:
         Causes that help, and do no more than a generic force would: no part of `final`.
     chosen : Fit or None
         Of the terms that the data chose, where the search went on from them.
+    nearest : Fit or None
+        The model without causes whose free runs follow the logs most nearly, where that is
+        another one than `base`: its colour may take a slow misfit for the sea's own.
     """
 
     base: Fit
@@ -173,11 +176,12 @@ class Search:
     given: Fit | None = None
     leaning: tuple[Candidate, ...] = ()
     chosen: Fit | None = None
+    nearest: Fit | None = None
 
     @property
     def before(self) -> Fit:
         """What is diagnosed: the model as it was given, or else the fit without causes."""
-        return self.base if self.given is None else self.given
+        return self.given or self.nearest or self.base
 
     def proof(self, held_out: Callable[[Integrator], HeldOut]) -> float:
         """Return the fall of −2 log L of held-out logs by all causes, each fit as it is run."""
@@ -333,10 +337,12 @@ def take_step(
     scores, forgetful = promises(problem, fit, near)
     asked = [*((fit, score) for score in shortlist(scores)), *forgetful]
     held_out.contributions(fit)
-    fits = likelier(refits(problem, asked, lambda found: held_out.prove(fit, found)))
+    fits = refits(problem, asked, lambda found: held_out.prove(fit, found))
+    again = case.from_far(fit, near)
     if not causes:
-        again = case.restart(fit, left, [s.hypothesis for s in scores if s.gain == -np.inf])
-        fits += [(hypothesis, found, held_out.prove(fit, found)) for hypothesis, found in again]
+        again += case.restart(fit, left, [s.hypothesis for s in scores if s.gain == -np.inf])
+    fits += [(hypothesis, found, held_out.prove(fit, found)) for hypothesis, found in again]
+    fits = likelier(fits)
     candidates = sorted(
         (
             assess_candidate(proof, fit, found, hypothesis, len(left) + passed_over, problem.names)

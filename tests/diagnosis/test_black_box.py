@@ -91,7 +91,8 @@ def test_away_from_the_logs_the_run_is_that_without_it(fitted, trial) -> None:
     u = trial.estimation["u"]
     beyond = int(np.argmin(one[:, 0] > u.max() + np.ptp(u) / 2))
     assert beyond > 0
-    np.testing.assert_array_equal(one[:beyond], two[:beyond])
+    # more terms are added in another order
+    np.testing.assert_allclose(one[:beyond], two[:beyond], rtol=1e-12)
 
 
 @pytest.mark.long

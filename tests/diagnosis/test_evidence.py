@@ -151,7 +151,8 @@ def test_variances_stay_positive_where_numbers_are_hardly_known() -> None:
     rng = np.random.default_rng([907, zlib.crc32(b"dead_bandpulses"), 2])
     trial = draw(rng, ("dead_band",), kind="pulses")
     found = diagnose([trial.estimation], validate=[trial.validation])
-    assert found.verdict in ("unexplained", "confused")
+    # no cause is a dead band: thrust that grows faster than the speed is a part of it at most
+    assert found.verdict != "named"
     stds = [q.std for c in (*found.causes, *found.candidates) for q in c.parameters.values()]
     assert np.isfinite(stds).all()
 

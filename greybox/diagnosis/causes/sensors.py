@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 
 # clocks that are looked for differ by less [s]
 _LATEST = 60.0
+# places of an antenna, in ship lengths ahead, at which other coefficients are looked for
+_PLACES = (-0.5, -0.375, -0.25, -0.125, 0.125, 0.25, 0.375, 0.5)
 # samples by which a hold between samples may pass for a clock
 UNRESOLVED = 0.75
 
@@ -89,7 +91,12 @@ class LeverArm(Cause):
         # on the hull, wherever the origin lies on it
         reach = {"lever_arm_x": length, "lever_arm_y": 0.5 * length}
         parameters = tuple(Parameter(n, "m", 0.0, -m, m, step=1e-3) for n, m in reach.items())
-        return (Hypothesis(self.id, self.id, parameters, (), apply, arguments=_moving(context)),)
+        far = tuple((share * length, 0.0) for share in _PLACES)
+        return (
+            Hypothesis(
+                self.id, self.id, parameters, (), apply, arguments=_moving(context), far=far
+            ),
+        )  # fmt: skip
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say where the antenna is."""
