@@ -47,6 +47,8 @@ def test_the_wind_is_found_in_a_tankers_trials(data_folder: Path, tmp_path: Path
     for name in ("Wuu", "Wvv"):
         assert wind["parameters"][name]["value"] < 0
     assert wind["p_adjusted"] < 1e-10
+    # beyond (3.51) whose free runs are as near as they can be
     for state in ("u", "v", "r"):
         gain = found["gain"][state]
-        assert gain["after"] - gain["before"] > 20, state
+        assert gain["after"] > 55, state
+        assert gain["ci"][0] > 5, state
