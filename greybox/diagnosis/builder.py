@@ -397,7 +397,14 @@ class DiagnosisBuilder:
                 f"{', '.join(turned)} came out negative: some thruster's column has the wrong sign "
                 f"or stands in another's place; greybox check may tell which."
             )
-        sensors = self.found.final.point.ship.sensors
+        final = self.found.final
+        limited = at_limit(self.case.problem(final.integrator), final.point)
+        if limited:
+            out.append(
+                f"{', '.join(limited)} ended at the most damping that a step can take: it, and the "
+                f"coefficients and causes that make up for it, say little by themselves."
+            )
+        sensors = final.point.ship.sensors
         if any(sensors.lever):
             out.append(
                 "the gain is measured on the log as its sensors show it; greybox compare moves "
@@ -428,6 +435,16 @@ def _or_alike(hypothesis: Hypothesis) -> str:
     if any(p.name == "lever_arm_x" for p in hypothesis.parameters):
         return ", or coupled inertia of sway and yaw, which looks alike"
     return ""
+
+
+def at_limit(problem: Problem, point: Point) -> list[str]:
+    """Return coefficients of damping that ended at the most that a step can take."""
+    least, values = problem.bounds(point)[0], point.vector()
+    return [
+        problem.names[i]
+        for i, low, value in zip(point.places, least, values, strict=False)
+        if np.isfinite(low) and np.isclose(value, low)
+    ]
 
 
 def kept_without_name(found: Search) -> list[str]:

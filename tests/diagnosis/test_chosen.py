@@ -8,6 +8,7 @@ from math import factorial
 import numpy as np
 import pytest
 
+from greybox.diagnosis.builder import at_limit
 from greybox.diagnosis.causes.sensors import LeverArm, abeam, alike_to_forces, turned_alike
 from greybox.diagnosis.chosen import _known_columns, _own_share, _told_apart, _with_sensors
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
@@ -75,6 +76,10 @@ def test_damping_stays_where_a_step_decays_more_the_more_it_is(integrator: Integ
     assert MONOTONE[integrator] <= told["Nr"] < 0
     r = trial.estimation["r"]
     least = dict(zip(names, problem.bounds(base.point)[0], strict=False))
+    # and one that ends there is told
+    theta[names.index("Nr")] = MONOTONE[integrator]
+    edge = replace(base.point, base=replace(base.point.base, theta=theta))
+    assert (at_limit(problem, edge), at_limit(problem, found.point)) == (["Nr"], [])
     expected = MONOTONE[integrator] * (r**2).sum() / (np.abs(r) ** 3).sum()
     assert least["N_|r|r"] == pytest.approx(expected)
 
