@@ -31,8 +31,9 @@ def term_hypothesis(cause: str, names: Sequence[str], context: Context) -> Hypot
 
 
 def listed(values: Mapping[str, tuple[float, float]]) -> str:
-    """Return estimates as text."""
-    return ", ".join(f"{n} = {with_error(v, s)}" for n, (v, s) in values.items())
+    """Return estimates as text: those beyond their standard error, or all where none is."""
+    sure = {n: (v, s) for n, (v, s) in values.items() if abs(v) > s} or values
+    return ", ".join(f"{n} = {with_error(v, s)}" for n, (v, s) in sure.items())
 
 
 def equations(values: Mapping[str, tuple[float, float]]) -> str:
