@@ -367,10 +367,12 @@ class DiagnosisProblem:
                 out.append((hypothesis, min(bounded, key=lambda f: f.cost)))
         return out
 
-    def from_far(self, fit: Fit, hypotheses: Sequence[Hypothesis]) -> list[tuple[Hypothesis, Fit]]:
+    def from_far(
+        self, fit: Fit, hypotheses: Sequence[Hypothesis], promised: Mapping[str, float]
+    ) -> list[tuple[Hypothesis, Fit]]:
         """Return fits from far values of hypotheses, with the coefficients of least squares there.
 
-        Only where their one-step errors are clearly smaller than with those of the fit.
+        Only where these make one-step errors clearly smaller than a refit from near promises.
 
         Parameters
         ----------
@@ -378,6 +380,8 @@ class DiagnosisProblem:
             Without any of the hypotheses.
         hypotheses : sequence of Hypothesis
             Of which those count that have far values.
+        promised : mapping of str to float
+            Fall of −2 log L that each promises from where it is, by key.
         """
         problem, out = self.problem(fit.integrator), []
         asked = [a for a in hypotheses if a.far]
@@ -386,7 +390,7 @@ class DiagnosisProblem:
             ways = [problem.add(fit.point, hypothesis, np.array(value)) for value in hypothesis.far]
             found = [self._least_squares(point) for point in ways]
             best = int(np.argmin([own for _, own in found]))
-            if level - found[best][1] < _REWIRED:
+            if level - found[best][1] < max(promised.get(hypothesis.key, 0.0), 0.0) + _REWIRED:
                 continue
             begun = self._refitted(ways[best], fit.integrator, found[best][0])
             if begun is not None and not begun.escaped:

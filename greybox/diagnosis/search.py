@@ -338,7 +338,7 @@ def take_step(
     asked = [*((fit, score) for score in shortlist(scores)), *forgetful]
     held_out.contributions(fit)
     fits = refits(problem, asked, lambda found: held_out.prove(fit, found))
-    again = case.from_far(fit, near)
+    again = case.from_far(fit, near, {s.hypothesis.key: s.gain for s in scores})
     if not causes:
         again += case.restart(fit, left, [s.hypothesis for s in scores if s.gain == -np.inf])
     fits += [(hypothesis, found, held_out.prove(fit, found)) for hypothesis, found in again]
