@@ -141,7 +141,7 @@ class Hypothesis:
         assert apply is not None
         return replace(
             self, parameters=(), apply=lambda ship, _: apply(ship, value), starts=(), variants=(),
-            only=True,
+            far=(), only=True,
         )  # fmt: skip
 
     @property

@@ -95,6 +95,8 @@ def test_only_the_place_abeam_of_an_antenna_is_sought_beside_coupled_inertia() -
     assert [p.high for p in arm.parameters] == [length, length / 2]
     other = abeam(arm)
     assert [p.name for p in other.parameters] == ["lever_arm_y"]
+    assert {len(value) for value in arm.far} == {2}
+    assert not other.far
     assert other.apply is not None
     assert other.apply(ship, np.array([0.3])).sensors.lever == (0, 0.3)
     # a sensor's defect has a name, or is no part of a model

@@ -119,7 +119,7 @@ def abeam(arm: Hypothesis) -> Hypothesis:
         lever = (ship.sensors.lever[0], float(value[0]))
         return replace(ship, sensors=replace(ship.sensors, lever=lever))
 
-    return replace(arm, parameters=arm.parameters[1:], apply=apply)
+    return replace(arm, parameters=arm.parameters[1:], apply=apply, far=())
 
 
 def alike_to_forces(one: Hypothesis, two: Hypothesis) -> bool:
