@@ -55,6 +55,24 @@ def test_defects_of_sensors_stand_beside_terms_that_imitate_them(defect: bool) -
     assert told["lever_arm"] == pytest.approx(ARM, abs=0.25)
 
 
+def test_an_antenna_far_off_is_sought_with_the_coefficients_of_least_squares() -> None:
+    trial = draw(np.random.default_rng([4, 2]), (), samples=500, positions=False)
+    ahead = 12.0
+
+    def seen(log: TrialLog) -> TrialLog:
+        return replace(log, channels={**log.channels, "v": log["v"] + ahead * log["r"]})
+
+    ready = prepare([seen(trial.estimation)], [trial.validation], None, "thesis", ["lever_arm"])
+    (arm,) = ready.hypotheses
+    base = ready.base()
+    ((hypothesis, found),) = ready.case.from_far(base, [arm], {})
+    assert hypothesis == arm
+    assert found.cost < base.cost
+    assert found.point.values[-1] == pytest.approx([ahead, 0.0], abs=1.0)
+    # nothing is begun where a refit from near promises as much
+    assert ready.case.from_far(base, [arm], {arm.key: np.inf}) == []
+
+
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 def test_damping_stays_where_a_step_decays_more_the_more_it_is(integrator: Integrator) -> None:
     z = np.linspace(MONOTONE[integrator], 0.0, 200)
