@@ -153,7 +153,7 @@ class DiagnosisBuilder:
         """Return the diagnosis."""
         found, case = self.found, self.case
         groups = self._groups()
-        before = self.model(found.nearest or found.base, self.record(()))
+        before = self.model(found.without, self.record(()))
         changed = found.final is not found.base
         after = self.model(found.final, self.record(found.causes)) if changed else before
         gain, runs, after = self.gain(before, after, validate, found.final)
@@ -327,7 +327,7 @@ class DiagnosisBuilder:
 
         From a first fit on, by default that of the model without causes.
         """
-        first = (self.found.nearest or self.found.base) if first is None else first
+        first = self.found.without if first is None else first
         logs = list(validate)
         if logs:
             later = _likelier_story(after, logs)

@@ -181,7 +181,12 @@ class Search:
     @property
     def before(self) -> Fit:
         """What is diagnosed: the model as it was given, or else the fit without causes."""
-        return self.given or self.nearest or self.base
+        return self.given or self.without
+
+    @property
+    def without(self) -> Fit:
+        """What a gain is measured against: no cause, runs as near to the logs as they can be."""
+        return self.nearest or self.base
 
     def proof(self, held_out: Callable[[Integrator], HeldOut]) -> float:
         """Return the fall of −2 log L of held-out logs by all causes, each fit as it is run."""

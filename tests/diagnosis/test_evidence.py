@@ -153,6 +153,7 @@ def test_variances_stay_positive_where_numbers_are_hardly_known() -> None:
     found = diagnose([trial.estimation], validate=[trial.validation])
     # no cause is a dead band: thrust that grows faster than the speed is a part of it at most
     assert found.verdict != "named"
+    assert {c.id for c in found.causes} <= {"quadratic_thrust"}
     stds = [q.std for c in (*found.causes, *found.candidates) for q in c.parameters.values()]
     assert np.isfinite(stds).all()
 
