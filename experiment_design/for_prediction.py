@@ -144,7 +144,7 @@ class PredictionDesign:
                 f"and design again after the first part of the trial"
             )
         elif self.missed:
-            shares = ", ".join(f"{n} {share:.0%}" for n, share in self.missed.items())
+            shares = ", ".join(f"{n} {100 * share:.0f} %" for n, share in self.missed.items())
             said += (
                 f". They hold for a ship that the prior's structure fits. The prior has no verdict "
                 f"on its predictions: what its free runs missed of logs that its diagnosis held "
@@ -153,8 +153,8 @@ class PredictionDesign:
         elif not self.level:
             said += (
                 f". They hold for a ship that the prior's structure fits. The prior has no verdict "
-                f"on its predictions: it is assumed to miss {_UNKNOWN_MISFIT:.0%} of each spread, "
-                f"most of which the trial tells, so take these numbers as a guess"
+                f"on its predictions: it is assumed to miss {100 * _UNKNOWN_MISFIT:.0f} % of each "
+                f"spread, most of which the trial tells, so take these numbers as a guess"
             )
         return f"{said}."
 
@@ -169,15 +169,15 @@ class PredictionDesign:
             f"{r.duration:g} s for prediction, both sides, {ranges}",
             *(["planned without an estimated model, from main dimensions"] if r.untried else []),
             self.headline(),
-            f"the first {self.validation_share:.0%} of each trial, a usual zig-zag or turn, judges "
-            f"an estimate of the rest, then joins it (--plan of greybox estimate)",
+            f"the first {100 * self.validation_share:.0f} % of each trial, a usual zig-zag or "
+            f"turn, judges an estimate of the rest, then joins it (--plan of greybox estimate)",
         ]
         if self.crossings:
             part = sum(b - a for a, b in self.crossings) / r.duration
             lines.append(
                 f"sway comes within {_CLOSE:g} deviations of its sensor from zero "
-                f"{len(self.crossings)} times, {part:.0%} of the trial: --margin-v of greybox "
-                f"estimate cuts these samples (Remark 4.2)"
+                f"{len(self.crossings)} times, {100 * part:.0f} % of the trial: --margin-v of "
+                f"greybox estimate cuts these samples (Remark 4.2)"
             )
         if self.design.keeping is not None:
             lines.append(self.design.keeping.sentence())

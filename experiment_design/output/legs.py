@@ -155,7 +155,9 @@ class LegPlan:
         count = Counter(leg.until.replace("_", " ") for legs in self.trials for leg in legs)
         kinds = ", ".join(f"{n} by {kind}" for kind, n in count.most_common())
         models = f"{self.draws} models " + (
-            f"with coefficients {_MISFIT:.0%} off" if self.assumed else "drawn from the prior"
+            f"with coefficients {100 * _MISFIT:.0f} % off"
+            if self.assumed
+            else "drawn from the prior"
         )
         said = (
             f"as legs, of which {kinds} end, the limits are kept with probability "

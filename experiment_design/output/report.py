@@ -224,7 +224,7 @@ def _std_table(design: Design, reference: Array | None) -> Table:
     for i, name in enumerate(design.names):
         value, std = float(design.values[i]), float(design.std[i])
         rows.append([
-            name, f"{value:.4g}", f"{std:.2g}", f"{abs(std / value):.1%}" if value else "–",
+            name, f"{value:.4g}", f"{std:.2g}", f"{100 * abs(std / value):.1f} %" if value else "–",
             *([] if reference is None else [f"{reference[i]:.2g}"]),
         ])  # fmt: skip
     return Table(

@@ -320,7 +320,7 @@ class Design(DisplayMixin):
         wide = max(14, *map(len, self.names))
         lines += ["", f"{'parameter':<{wide}}{'prior':>12}{'std err':>12}{'relative':>11}"]
         for name, value, std in zip(self.names, self.values, self.std, strict=True):
-            share = f"{abs(std / value):.1%}" if value else "-"
+            share = f"{100 * abs(std / value):.1f} %" if value else "-"
             lines.append(f"{name:<{wide}}{value:>12.4g}{std:>12.2g}{share:>11}")
         if self.alternatives:
             lines += ["", f"{'instead of':<28}{'tried':>7}{'kept':>7}  this plan gives"]

@@ -183,7 +183,7 @@ def _parts_words(design: Design, band: MotionBand) -> str:
     judged = [p for p in own if p.name == VALIDATION]
     if judged:
         said[own.index(judged[0])] += (
-            f", {design.share(judged[0]):.0%}, by which an estimate of the rest is judged"
+            f", {100 * design.share(judged[0]):.0f} %, by which an estimate of the rest is judged"
         )
     return f" ({', '.join(said)})"
 

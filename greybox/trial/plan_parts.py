@@ -139,8 +139,8 @@ class SailedPlan:
         """What was taken from the plan."""
         shifted = f", shifted by {self.shift:g} s," if self.shift else ""
         said = (
-            f"'{self.log}' follows the plan '{self.plan}'{shifted} in {self.followed:.0%} of its "
-            f"samples"
+            f"'{self.log}' follows the plan '{self.plan}'{shifted} in "
+            f"{100 * self.followed:.0f} % of its samples"
         )
         out = [f"{self.samples[n]} of {n}" for n in LEFT_OUT if self.samples.get(n)]
         if self.samples.get("outside"):
@@ -249,9 +249,9 @@ def by_parts(
         trial, shift, share = _nearest(segments, plan)
         if share < _FOLLOWED:
             raise LogError(
-                f"'{name}' follows the plan '{trial.name}' in {share:.0%} of its samples at best, "
-                f"shifted by {shift:g} s, and {_FOLLOWED:.0%} are needed: name the plan that was "
-                f"sailed, or leave out --plan."
+                f"'{name}' follows the plan '{trial.name}' in {100 * share:.0f} % of its samples "
+                f"at best, shifted by {shift:g} s, and {100 * _FOLLOWED:.0f} % are needed: name "
+                f"the plan that was sailed, or leave out --plan."
             )
         counts: dict[str, int] = {}
         own: dict[str, list[TrialLog]] = {TRIAL: [], VALIDATION: []}

@@ -287,7 +287,7 @@ def test_a_trial_begins_with_a_usual_manoeuvre_that_judges_the_estimate(found, e
     assert (trial["part"], trial["to"]) == ("trial", 200.0)
     assert trial["from"] == validation["to"]
     assert found.to_dict()["prediction"]["validation_share"] == validation["share"] <= 1 / 3
-    assert f"the first {validation['share']:.0%} of each trial" in found.summary()
+    assert f"the first {100 * validation['share']:.0f} % of each trial" in found.summary()
     r = found.design.request
     begin = round(trial["from"] / r.sample_time)
     plan = found.design.to_pandas()
@@ -347,10 +347,10 @@ def test_a_diagnosed_prior_errs_by_what_its_held_out_runs_missed(found, model, m
     assert plan.misfit["u"] >= 0.1 * searched[0].spread[0]
     assert plan.misfit["v"] >= 0.8 * searched[0].spread[1]
     said = plan.headline()
-    assert "(u 10%, v 80% of the spread) is taken to stay" in said
+    assert "(u 10 %, v 80 % of the spread) is taken to stay" in said
     assert "has no verdict" in said
     assert "has no verdict" not in found.headline()
-    assert "assumed to miss 30%" in replace(plan, level="", missed={}).headline()
+    assert "assumed to miss 30 %" in replace(plan, level="", missed={}).headline()
     # a plan that breaks its limits is told as one, by its notes and by what comes next
     note = plan.design.notes[0]
     assert note.startswith("the limits are kept with probability 0.15, 0.9 was asked for: do not")

@@ -232,7 +232,7 @@ def test_the_validation_of_a_plan_judges_and_then_takes_part(tmp_path, logs, cap
     assert main([*words, str(other), "--plan", str(plan)]) == 1
     error = capsys.readouterr().err
     assert "'other' follows the plan 'plan.csv' in " in error
-    assert "and 80% are needed" in error
+    assert "and 80 % are needed" in error
     assert error.count("\n") == 1
 
 

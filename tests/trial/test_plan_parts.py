@@ -86,7 +86,7 @@ def test_segments_of_one_file_have_one_shift():
 
 @pytest.mark.parametrize("seed", range(1, 6))
 def test_another_trial_does_not_follow(seed):
-    with pytest.raises(LogError, match=r"follows the plan 'plan.csv' in \d\d% .* 80% are needed"):
+    with pytest.raises(LogError, match=r"follows the plan 'plan.csv' in \d\d % .* 80 % are needed"):
         by_parts([sailed(planned(seed))], [planned()])
 
 
