@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ class Point:
     hypotheses: tuple[Hypothesis, ...] = ()
     values: tuple[Array, ...] = ()
 
-    @property
+    @cached_property
     def ship(self) -> Ship:
         """The ship with every hypothesis applied."""
         ship = self.base

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import floor, inf, isfinite
 from typing import Any, Literal, get_args
 
@@ -327,15 +328,15 @@ class Vessel(DisplayMixin):
         for key, words in (
             ("lag_on", get_args(LagOn)), ("delay_on", get_args(DelayOn)), ("rate_on", ()),
         ):  # fmt: skip
-            chosen, known = getattr(self.actuation, key), (*words, *self.commands)
-            if chosen is not None and chosen not in known:
+            chosen = getattr(self.actuation, key)
+            if chosen is not None and chosen not in (known := (*words, *self.commands)):
                 raise VesselError(
                     f"{key} of [actuation] is '{chosen}'.{suggestion(str(chosen), known)} Use "
                     f"{', '.join(words)}{' or ' if words else ''}a column that moves a thruster: "
                     f"{', '.join(self.commands)}."
                 )
 
-    @property
+    @cached_property
     def commands(self) -> tuple[str, ...]:
         """Log columns that move the thrusters, each once."""
         return tuple(dict.fromkeys(c for t in self.thrusters for c in t.columns))

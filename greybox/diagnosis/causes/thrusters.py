@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -15,7 +15,8 @@ from greybox.diagnosis.causes.sensors import UNRESOLVED
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.ship import Ship
 from greybox.notebook import with_error
-from greybox.vessel.vessel import Actuation, DelayOn, LagHeld, LagOn
+from greybox.vessel.thrust import ThrustLaw
+from greybox.vessel.vessel import Actuation, DelayOn, LagHeld, LagOn, Thruster
 
 Array = NDArray[np.float64]
 
@@ -29,10 +30,13 @@ _STRONGEST = 10.0
 _RATES, _LEAST_RATE = (0.5, 0.2, 0.06), 0.01
 
 
-def with_thruster(ship: Ship, index: int, **changes: object) -> Ship:
-    """Return the ship with one thruster changed."""
+def with_thrusters(
+    ship: Ship, members: Sequence[int], changed: Callable[[Thruster], Thruster]
+) -> Ship:
+    """Return the ship with some of its thrusters changed."""
     thrusters = list(ship.vessel.thrusters)
-    thrusters[index] = replace(thrusters[index], **changes)  # type: ignore[arg-type]
+    for i in members:
+        thrusters[i] = changed(thrusters[i])
     return replace(ship, vessel=replace(ship.vessel, thrusters=tuple(thrusters)))
 
 
@@ -108,10 +112,9 @@ class ThrusterGain(Cause):
 
         def gain(members: Sequence[int], key: str, most: float) -> Hypothesis:
             def apply(ship: Ship, value: Array) -> Ship:
-                for i in members:
-                    own = ship.vessel.thrusters[i].gain
-                    ship = with_thruster(ship, i, gain=own * float(value[0]))
-                return ship
+                return with_thrusters(
+                    ship, members, lambda t: replace(t, gain=t.gain * float(value[0]))
+                )
 
             parameter = Parameter(f"gain_{thrusters[members[0]].speed}", "1", 0.85, 0.0, most, 1.0)
             driven = dict.fromkeys(c for i in members for c in thrusters[i].columns)
@@ -376,13 +379,10 @@ class QuadraticThrust(Cause):
             reference = float(np.mean([context.speeds[thrusters[i].speed] for i in members]))
 
             def apply(ship: Ship, value: Array) -> Ship:
-                for i in members:
-                    law = replace(
-                        ship.vessel.thrusters[i].thrust,
-                        quadratic_share=float(value[0]), reference=reference,
-                    )  # fmt: skip
-                    ship = with_thruster(ship, i, thrust=law)
-                return ship
+                def of(law: ThrustLaw) -> ThrustLaw:
+                    return replace(law, quadratic_share=float(value[0]), reference=reference)
+
+                return with_thrusters(ship, members, lambda t: replace(t, thrust=of(t.thrust)))
 
             parameter = Parameter("quadratic_share", "1", 0.3, 0.0, 1.0)
             driven = dict.fromkeys(c for i in members for c in thrusters[i].columns)
@@ -428,8 +428,10 @@ class AngleOffset(Cause):
                 continue
 
             def apply(ship: Ship, value: Array, i: int = i) -> Ship:
-                own = ship.vessel.thrusters[i].angle_offset
-                return with_thruster(ship, i, angle_offset=own + float(value[0]))
+                more = float(value[0])
+                return with_thrusters(
+                    ship, [i], lambda t: replace(t, angle_offset=t.angle_offset + more)
+                )
 
             parameter = Parameter(f"offset_{column}", "rad", 0.0, -0.8, 0.8)
             key = f"{self.id}:{column}:{i}"
