@@ -45,6 +45,15 @@ def limited(monkeypatch):
     return change
 
 
+@pytest.fixture
+def hasty():
+    """Designs by searches of a few evaluations."""
+    from designs import hasty_search
+
+    with hasty_search():
+        yield
+
+
 @pytest.fixture(scope="session")
 def thesis():
     return get_structure("thesis")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from experiment_design.constraints.limits import LimitReport, TrialLimits
 from experiment_design.optimise.campaign import covariance_of
@@ -19,6 +22,36 @@ from greybox.model.noise import NoiseLevels
 from greybox.study.chapter6 import TRUE
 from greybox.vessel.toml import load_vessel
 from greybox.vessel.vessel import Limits
+
+
+@contextmanager
+def hasty_search() -> Iterator[None]:
+    """Search with few evaluations: what is aimed at is tested, not how near a search comes."""
+    from experiment_design import design
+    from experiment_design.certificate import certificate, trajectory_bound
+    from experiment_design.feasibility import constraint_satisfaction
+    from experiment_design.optimise import campaign, envelope_search, search
+
+    few = {
+        search: {"_DRAWS": 400, "_OUTER": 3, "_ITERATIONS": 5, "_LIMITED_ITERATIONS": 5},
+        campaign: {
+            "_EVALUATIONS": 1000, "_CHAINS": 1, "_ROUNDS": 1, "_LIMITED": 1, "_LEAST": 20,
+            "REFERENCE": 20,
+        },
+        constraint_satisfaction: {"_TIGHTENINGS": 1},
+        certificate: {"_DRAWS": 20, "_KEPT": 3, "_BUDGET": 20, "_LEAST": 10, "_ASCENT": 10},
+        trajectory_bound: {
+            "_POINTS": (5, 6), "_FORCES": (5, 6), "_STEPS": (2, 1), "_RANGES": 2, "_FINER": 1,
+        },
+        envelope_search: {"RANDOM": 40, "_CHAINS": 1, "_ROUNDS": 6},
+        design: {"_POLISH": 2},
+    }  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        for module, numbers in few.items():
+            for name, number in numbers.items():
+                patch.setattr(module, name, number)
+        yield
+
 
 REGIME = (("u", 1), ("v", 1))
 PROCESS = np.array([2e-3, 2e-3, 4e-4])

@@ -287,18 +287,6 @@ def test_two_models_and_predictions_meet_the_same_rules():
 BRIEF = ("--duration", "60", "--effort", "0.001", "--workers", "1", "--seed", "3")
 
 
-@pytest.fixture
-def hasty(monkeypatch):
-    """Searches of a few evaluations: what they aim at is tested, not how near they come."""
-    from experiment_design import design
-    from experiment_design.feasibility import constraint_satisfaction
-    from experiment_design.optimise import campaign
-
-    monkeypatch.setattr(campaign, "_LEAST", 20)
-    monkeypatch.setattr(constraint_satisfaction, "_TIGHTENINGS", 1)
-    monkeypatch.setattr(design, "_POLISH", 2)
-
-
 def test_every_option_has_a_value_to_try():
     assert set(VALUES) | set(UNCHANGED) == set(options_of_design())
 
