@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
-from designs import thesis_model
+from designs import hasty_search, thesis_model
 from schemas import schema
 
 from greybox.commands.main import main
@@ -58,11 +58,13 @@ def run(folder, *options, model="model.json"):
 def designed(folder):
     """Plan and JSON of a short design."""
     out = folder / "short.json"
-    status, plan = run(folder, *SHORT, "--json", str(out))
+    with hasty_search():
+        status, plan = run(folder, *SHORT, "--json", str(out))
     assert status == 0
     return plan.read_bytes(), json.loads(out.read_text())
 
 
+@pytest.mark.usefixtures("hasty")
 def test_plan_and_json(folder, capsys):
     out = folder / "design.json"
     status, plan = run(
@@ -144,11 +146,13 @@ def test_a_plan_with_parts_is_read_as_a_log(folder, tmp_path):
     assert len(pd.read_csv(out)) == 20
 
 
+@pytest.mark.usefixtures("hasty")
 def test_same_seed_same_bytes(folder, designed):
     _, plan = run(folder, *SHORT)
     assert plan.read_bytes() == designed[0]
 
 
+@pytest.mark.usefixtures("hasty")
 def test_surge_model(folder, capsys):
     status, plan = run(folder, "--duration", "200", "--json", "-", model="surge.json")
     assert status == 0
@@ -167,6 +171,7 @@ def test_campaign_has_a_trial_column(folder):
     assert table.groupby("trial").size().to_dict() == {1: 100, 2: 100}
 
 
+@pytest.mark.usefixtures("hasty")
 def test_sea_room_file(folder):
     room = folder / "room.csv"
     room.write_text("x_n,y_n\n-150,-150\n150,-150\n150,150\n-150,150\n")
@@ -192,6 +197,7 @@ def test_sea_rooms_that_are_none(folder, capsys, text, message):
     assert not plan.exists()
 
 
+@pytest.mark.usefixtures("hasty")
 def test_between(folder, capsys):
     pair = [str(folder / "model.json"), str(folder / "other.json")]
     status, plan = run(folder, "--duration", "100", "--between", *pair, "--json", "-")
@@ -209,6 +215,7 @@ def test_least_time(folder, capsys):
     assert len(pd.read_csv(plan)) < 400
 
 
+@pytest.mark.usefixtures("hasty")
 def test_one_function_of_the_parameters(folder, capsys):
     status, _ = run(folder, "--duration", "100", "--predictor", "basic", "--of", "Yvv/Ymu",
                     "--json", "-")  # fmt: skip
@@ -218,6 +225,7 @@ def test_one_function_of_the_parameters(folder, capsys):
     assert set(data["predicted_std"]) == {"Yvv", "Ymu"}
 
 
+@pytest.mark.usefixtures("hasty")
 def test_prior_of_earlier_trials(folder, designed, capsys):
     run(folder, *SHORT, "--json", "-", "--prior", str(folder / "prior.json"))
     both = json.loads(capsys.readouterr().out)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from designs import make_request, ship_file, thesis_model
+from designs import hasty_search, make_request, ship_file, thesis_model
 from virtual import virtual_log, write_csv
 
 from experiment_design.after import lacking_margin, log_moments, log_motion, sailed_trial
@@ -131,6 +131,7 @@ def test_a_start_without_its_margin_is_named(request_) -> None:
     assert lacking_margin(slow) == "u"
 
 
+@pytest.mark.usefixtures("hasty")
 def test_the_plan_covers_what_has_not_been_sailed(request_, model) -> None:
     request = replace(request_, covariance=None, effort=0.15)
     alone = design_for_prediction(request, model)
@@ -179,9 +180,10 @@ def run(files, *options):
 @pytest.fixture(scope="module")
 def staged(files):
     """The rest of a trial, for prediction."""
-    status = run(files, "--after", str(files / "first.csv"), "--remaining", "120", "--area",
-                 str(files / "room.csv"), "--save-model", str(files / "model.json"), "--json",
-                 str(files / "plan.json"))  # fmt: skip
+    with hasty_search():
+        status = run(files, "--after", str(files / "first.csv"), "--remaining", "120", "--area",
+                     str(files / "room.csv"), "--save-model", str(files / "model.json"), "--json",
+                     str(files / "plan.json"))  # fmt: skip
     assert status == 0
     return json.loads((files / "plan.json").read_text())
 
@@ -200,6 +202,7 @@ def test_the_command_estimates_and_goes_on(files, staged) -> None:
     assert saved.record["verdict"]["prediction"]["level"] in ("good", "limited", "poor")
 
 
+@pytest.mark.usefixtures("hasty")
 def test_a_saved_model_need_not_be_estimated_again(files, staged) -> None:
     first = (files / "plan.csv").read_bytes()
     status = run(files, "--after", str(files / "first.csv"), "--duration", "120", "--area",
@@ -208,6 +211,7 @@ def test_a_saved_model_need_not_be_estimated_again(files, staged) -> None:
     assert (files / "plan.csv").read_bytes() == first
 
 
+@pytest.mark.usefixtures("hasty")
 def test_for_coefficients_what_was_learnt_is_the_prior(files, staged) -> None:
     common = ("--for", "coefficients", "--predictor", "basic", "--json", str(files / "c.json"),
               "--model", str(files / "model.json"))  # fmt: skip

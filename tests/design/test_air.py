@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from designs import make_request, thesis_model
+from designs import hasty_search, make_request, thesis_model
 
 from experiment_design import DesignRequest, TrialLimits, design_trial, prepare_request
 from experiment_design.feasibility.least_violation import moved_constant
@@ -43,7 +43,8 @@ def through_the_air(motion, wind):
 
 @pytest.fixture(scope="module")
 def free():
-    return design_trial(wind_request(), workers=1, alternatives=False)
+    with hasty_search():
+        return design_trial(wind_request(), workers=1, alternatives=False)
 
 
 def test_gusts_are_of_regressors_alone():
@@ -99,6 +100,7 @@ def test_a_wind_sensor_of_unknown_noise():
     assert any("state wind_std under [sensors]" in n for n in design.notes)
 
 
+@pytest.mark.usefixtures("hasty")
 def test_only_a_measured_wind_has_a_margin():
     with pytest.raises(UsageError, match="predictor 'augmented' does not measure it"):
         prepare_request(

@@ -109,6 +109,7 @@ def test_the_same_seed_gives_the_same_plan():
     assert not np.array_equal(one.commands[0], other.commands[0])
 
 
+@pytest.mark.usefixtures("hasty")
 def test_an_interrupt_after_the_search_keeps_the_plan(monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
@@ -153,6 +154,7 @@ def test_each_trial_tells_its_steady_start():
     assert note.startswith("trial 2 starts from a steady motion: u ")
 
 
+@pytest.mark.usefixtures("hasty")
 def test_a_locked_thruster_has_equal_limits():
     request = make_request(
         structure="surge", vessel=limited_ship(angles=(0.8, 0.8)), effort=0.05, duration=150.0
@@ -329,6 +331,7 @@ def test_a_target_is_reached_by_what_keeps_the_limits_surely():
     assert design.std[0] <= 0.045 * 1.03
 
 
+@pytest.mark.usefixtures("hasty")
 def test_a_target_is_judged_after_the_tightening(monkeypatch):
     uncertain = np.diag((0.2 * np.abs(make_request().theta)) ** 2)
     request = make_request(duration=30.0, effort=0.01, covariance=uncertain)
@@ -356,6 +359,7 @@ def test_a_target_that_the_plan_misses_is_told(good):
     assert missed_targets(good.request, [problem], units) == []
 
 
+@pytest.mark.usefixtures("hasty")
 def test_two_names_of_one_column_are_one_target():
     request = make_request(duration=30.0, effort=0.01)
     found = least_duration(request, {"Wuu": 8.0, "Yvv": 9.0, "Xuu": 7.0}, workers=1)
@@ -439,9 +443,9 @@ def test_the_closest_plan_on_request():
     assert any("headings cannot cover 30 rad" in n for n in design.notes)
 
 
-def test_the_closest_plan_to_margins_out_of_reach(monkeypatch):
+@pytest.mark.usefixtures("hasty")
+def test_the_closest_plan_to_margins_out_of_reach():
     """It keeps the margins nearest to them, and is held against those that were asked for."""
-    monkeypatch.setattr("experiment_design.optimise.campaign._LEAST", 20)
     asked = DesignRequest(
         60.0, TrialLimits(margins={"u": 9.0}), predictor="basic", effort=0.02, regime="u+"
     )
@@ -619,6 +623,7 @@ def good():
     return design_trial(make_request(duration=120.0, effort=0.1), workers=1, alternatives=False)
 
 
+@pytest.mark.usefixtures("hasty")
 def test_a_design_starts_from_what_it_is_given(good):
     request = make_request(duration=120.0, effort=0.02)
     again = design_trial(request, workers=1, alternatives=False, first=good.levels)
@@ -641,6 +646,7 @@ def test_a_first_sequence_need_not_keep_the_limits():
     assert np.isfinite(design.std).all()
 
 
+@pytest.mark.usefixtures("hasty")
 def test_a_first_sequence_is_brought_within_the_rates(good):
     request = make_request(duration=120.0, effort=0.02, vessel=limited_ship(0.5, 0.01))
     assert np.abs(np.diff(good.levels[0], axis=0)).max(axis=0)[1] > 0.1

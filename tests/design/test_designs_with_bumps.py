@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from designs import thesis_model
 
 from experiment_design import (
@@ -32,6 +33,7 @@ def with_bump(model: ManoeuvringModel, size: float) -> ManoeuvringModel:
     )
 
 
+@pytest.mark.usefixtures("hasty")
 def test_it_moves_the_ship_and_is_no_parameter() -> None:
     asked = DesignRequest(
         60.0, TrialLimits(margins={"u": 0.2, "v": 0.2}), regime="u+v+", start=(1.5, 1.2, 0.0, 0.0),

@@ -317,6 +317,7 @@ def gained(**after):
     return {"gain": {s: {"before": 0.0, "after": fit, "ci": [0, 1]} for s, fit in after.items()}}
 
 
+@pytest.mark.usefixtures("hasty")
 def test_a_diagnosed_prior_errs_by_what_its_held_out_runs_missed(found, model, monkeypatch) -> None:
     diagnosis = gained(u=90.0, v=20.0, r=None)
     of_diagnosis = replace(model, record={"diagnosis": diagnosis})
@@ -404,6 +405,7 @@ def files(tmp_path_factory):
     return place
 
 
+@pytest.mark.usefixtures("hasty")
 def test_the_command(files, capsys: pytest.CaptureFixture[str]) -> None:
     plan = files / "plan.csv"
     asked = ["design", "--vessel", str(files / "ship.toml"), "--model", str(files / "model.json"),
@@ -462,6 +464,7 @@ def test_a_trial_starts_on_the_fastest_course_that_its_cap_allows(envelope) -> N
     np.testing.assert_allclose(envelope.rollout.run(held).state[0, -1, :3], slow.starts[0][:3])
 
 
+@pytest.mark.usefixtures("hasty")
 def test_the_closest_plan_where_no_other_is_found(model) -> None:
     room = TrialLimits(margins={"u": 0.2}, area=Circle(0.0, 0.0, 8.0))
     request = request_of(duration=60.0, effort=0.01, limits=room)
@@ -474,6 +477,7 @@ def test_the_closest_plan_where_no_other_is_found(model) -> None:
     assert design.missed()[0].startswith("the sea room is missed by ")
 
 
+@pytest.mark.usefixtures("hasty")
 def test_the_closest_plan_to_a_margin_out_of_reach(model) -> None:
     """It says which margin it keeps, and is held against the one that was asked for."""
     told = OutOfReach(TrialLimits(margins={"u": 9.0}), None, "no motion keeps 9 m/s.")
@@ -499,6 +503,7 @@ def test_the_closest_plan_to_a_margin_out_of_reach(model) -> None:
     assert report.missed == pytest.approx(9.0 - kept)
 
 
+@pytest.mark.usefixtures("hasty")
 def test_a_start_short_of_its_margins_is_led_in(model) -> None:
     request = request_of(duration=200.0, covariance=None, starts=(np.zeros(4),), effort=0.1)
     found = design_for_prediction(request, model, kept_starts=1)

@@ -379,6 +379,7 @@ def folder(tmp_path_factory):
     return where
 
 
+@pytest.mark.usefixtures("hasty")
 @pytest.mark.parametrize(
     ("options", "duration"),
     [

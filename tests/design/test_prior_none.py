@@ -50,6 +50,7 @@ LONG = pytest.mark.long
 WHOLE = (BRIEF, ("trial", "validation"))
 
 
+@pytest.mark.usefixtures("hasty")
 @pytest.mark.parametrize(
     ("name", "duration", "hold", "options", "parts"),
     [
@@ -75,6 +76,7 @@ def test_a_plan_comes_for_each_kind_of_ship(
     require_plan(plan, name, said.out, json.loads(out.read_text())["notes"], *parts)
 
 
+@pytest.mark.usefixtures("hasty")
 def test_sheet_and_page_say_it_first(tmp_path):
     vessel = vessel_file(tmp_path, "training-ship-105m")
     sheet, page = tmp_path / "sheet.html", tmp_path / "page.html"
@@ -87,6 +89,7 @@ def test_sheet_and_page_say_it_first(tmp_path):
     assert "Planned without an estimated model, from main dimensions" in page.read_text()
 
 
+@pytest.mark.usefixtures("hasty")
 def test_thesis_ship_of_length_alone(tmp_path, capsys):
     status, _ = design(tmp_path, "thesis", "--prior", "none", "--duration", "100", *FAST)
     assert status == 0
