@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.rotation import body_to_ned, ned_to_body
+from greybox.rotation import body_to_ned
 from greybox.study.blind_inputs import RATES, Programme
 
 Array = NDArray[np.float64]
@@ -29,6 +30,8 @@ EXTRA = (
 STEP = 0.1
 # seconds that a ship runs before its log begins: late sensors and commands have a past
 LEAD = 10
+# ships up to which each is computed by numbers of its own
+_FEW = 8
 # where the two azimuths stand ahead of the origin [m]
 _X1, _X2 = 9.0, -9.0
 
@@ -137,6 +140,33 @@ class History:
         return t, north, east
 
 
+def _accelerations(
+    theta: Any, advance: Any, north: Any, east: Any, blown_north: Any, blown_east: Any, u: Any,
+    v: Any, r: Any, c: Any, s: Any, along: Any, across: Any, turning: Any,
+) -> tuple[Any, ...]:  # fmt: skip
+    """Return du/dt, dv/dt, dr/dt of (3.51), then u and v through the water.
+
+    Of one ship by numbers, or of B by arrays (B,), in a current and a wind north and east, on a
+    heading of a cosine and a sine, under a force ahead, to starboard and turning.
+    """
+    (Xu, Xvr, Xuu, Wuu, Xmu, Xkappa, Yv, Yur, Yvv, Yvr, Wvv, Ymu,
+     Nr, Nuv, Nvv, Nvr, Wuv, Nmu) = theta  # fmt: skip
+    ur, vr = u - (c * north + s * east), v - (c * east - s * north)
+    uq, vq = u - (c * blown_north + s * blown_east), v - (c * blown_east - s * blown_north)
+    size = abs(vr)
+    loss = 1 - advance * ur
+    du = (Xu + Xuu * abs(ur)) * ur + Xvr * vr * r + Wuu * abs(uq) * uq + (Xmu + Xkappa * ur) * along
+    dv = (
+        (Yv + Yvv * size) * vr + (Yur * ur + Yvr * size) * r + Wvv * abs(vq) * vq
+        + Ymu * loss * across
+    )  # fmt: skip
+    dr = (
+        (Nr + Nvr * size) * r + (Nuv * ur + Nvv * size) * vr + Wuv * uq * vq
+        + Nmu * loss * turning
+    )  # fmt: skip
+    return du, dv, dr, ur, vr
+
+
 class _Fleet:
     """The parameters of B ships as arrays, and their equations."""
 
@@ -159,6 +189,13 @@ class _Fleet:
         )  # fmt: skip
         own = (self.extra, self.unevenness, self.shallow[0], self.swell[0])
         self.peculiar = any(part.any() for part in own)
+        self.few = len(ships) <= _FEW
+        self.each = self.theta.T.tolist()
+
+    def alter(self, which: NDArray[np.bool_], factor: Array) -> None:
+        """Multiply the parameter of each of some ships (B,) that changes, by its factor (B,)."""
+        self.theta[self.change[0, which].astype(int), which] *= factor[which]
+        self.each = self.theta.T.tolist()
 
     def decay(self, lag: Array, step: float) -> Array:
         """Return what remains of a lagged value at the start, middle and end of a step."""
@@ -171,35 +208,24 @@ class _Fleet:
         law = (1 - self.quadratic) * n + self.quadratic * n * size / self.reference
         force = np.where(size < self.dead_band, 0.0, law) * self.gain[:, None]
         loss, centre, width = self.interaction
-        race = loss * np.exp(-(((angle[0] - centre) / width) ** 2))
-        force[1] *= 1 - np.where(n[0] > 0, race, 0.0)
+        if loss.any():
+            race = loss * np.exp(-(((angle[0] - centre) / width) ** 2))
+            force[1] *= 1 - np.where(n[0] > 0, race, 0.0)
         along, across = force * np.cos(angle), force * np.sin(angle)
         return np.array([along[0] + along[1], across[0] + across[1],
                          _X1 * across[0] + _X2 * across[1]])  # fmt: skip
 
     def rates(self, x: Array, tau: Array, wind: Array, t: float) -> Array:
         """Return du/dt, dv/dt, dr/dt and dψ/dt (4, B) of (3.51)."""
-        (Xu, Xvr, Xuu, Wuu, Xmu, Xkappa, Yv, Yur, Yvv, Yvr, Wvv, Ymu,
-         Nr, Nuv, Nvv, Nvr, Wuv, Nmu) = self.theta  # fmt: skip
         u, v, r, psi = x
-        through = ned_to_body(self.current[0], self.current[1], psi)
-        ur, vr = u - through[0], v - through[1]
-        blow = ned_to_body(wind[0], wind[1], psi)
-        uq, vq = u - blow[0], v - blow[1]
-        size = np.abs(vr)
-        loss = 1 - self.advance * ur
-        du = (
-            (Xu + Xuu * np.abs(ur)) * ur + Xvr * vr * r + Wuu * np.abs(uq) * uq
-            + (Xmu + Xkappa * ur) * tau[0]
-        )  # fmt: skip
-        dv = (
-            (Yv + Yvv * size) * vr + (Yur * ur + Yvr * size) * r + Wvv * np.abs(vq) * vq
-            + Ymu * loss * tau[1]
-        )  # fmt: skip
-        dr = (
-            (Nr + Nvr * size) * r + (Nuv * ur + Nvv * size) * vr + Wuv * uq * vq
-            + Nmu * loss * tau[2]
-        )  # fmt: skip
+        c, s = np.cos(psi), np.sin(psi)
+        given = (self.advance, *self.current, *wind, u, v, r, c, s, *tau)
+        if self.few:
+            # the same sums one ship at a time: for few, arrays cost more than the sums do
+            rows = zip(self.each, *[g.tolist() for g in given], strict=True)
+            du, dv, dr, ur, vr = np.array([_accelerations(*row) for row in rows]).T
+        else:
+            du, dv, dr, ur, vr = _accelerations(self.theta, *given)
         if self.peculiar:
             turn = np.abs(r)
             e = self.extra
@@ -209,7 +235,9 @@ class _Fleet:
             du += push * np.cos(self.swell[2] - psi)
             dv += e[1] * vr**3 + e[4] * turn * r + e[5] * turn * vr + e[7]
             dv += e[9] * r + e[11] * tau[0] + e[13] * np.abs(ur) * ur
-            dv += self.unevenness * Yv * np.maximum(vr, 0.0) + push * np.sin(self.swell[2] - psi)
+            dv += self.unevenness * self.theta[6] * np.maximum(vr, 0.0) + push * np.sin(
+                self.swell[2] - psi
+            )
             dr += e[2] * r**3 + e[3] * turn * r + e[6] * turn * vr + e[8]
             dr += e[10] * vr + e[12] * tau[0] + e[14] * np.abs(ur) * ur
         return np.array([du, dv, dr, r])
@@ -260,20 +288,20 @@ def simulate_ships(
     stages = np.array([0.0, 0.5, 1.0])[:, None] * step
     everyone, each = np.arange(count), np.arange(4)[:, None]
     straight = fleet.moving | linear
+    any_straight = bool(straight.any())
     with np.errstate(all="ignore"):
         for k in range(seconds - 1):
             commands[k + 1] = helm.next(k, x[3], commands[k])
-            where, factor, since = fleet.change
-            now = since == k
+            now = fleet.change[2] == k
             if now.any():
-                fleet.theta[where[now].astype(int), everyone[now]] *= factor[now]
+                fleet.alter(now, fleet.change[1])
             for i in range(inner):
                 t = k + i * step
                 # the middle of the step tells which second it lies in
-                at = np.clip(t + step / 2 - fleet.delay, 0, seconds - 1)
+                at = np.minimum(np.maximum(t + step / 2 - fleet.delay, 0), seconds - 1)
                 before = np.floor(at + 1e-9).astype(int)
-                wanted = np.repeat(commands[before, each, everyone][:, None], 3, axis=1)
-                if straight.any():
+                wanted = commands[before, each, everyone][:, None].repeat(3, axis=1)
+                if any_straight:
                     share = np.maximum(t + stages - fleet.delay[:, None], 0) - before[:, None]
                     after = commands[np.minimum(before + 1, k + 1), each, everyone][:, None]
                     wanted = np.where(straight, wanted + share * (after - wanted), wanted)
@@ -285,9 +313,8 @@ def simulate_ships(
                     wanted = wanted + (moved[:, None] - wanted) * keep_own
                     moved = wanted[:, 2]
                 n = wanted[:2] + (speed[:, None] - wanted[:2]) * keep_speed
-                angle = np.clip(
-                    play[:, None], wanted[2:] - fleet.backlash, wanted[2:] + fleet.backlash
-                )
+                angle = np.maximum(play[:, None], wanted[2:] - fleet.backlash)
+                angle = np.minimum(angle, wanted[2:] + fleet.backlash)
                 raw = fleet.thrust(n, angle)
                 tau = raw + (force[:, None] - raw) * keep_force
                 speed, play, force = n[:, 2], angle[:, 2], tau[:, 2]
