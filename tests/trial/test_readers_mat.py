@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import mmap
+import os
 import pickle
 import struct
 import zlib
+from dataclasses import asdict, replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -13,13 +18,44 @@ from scipy import sparse
 from scipy.io import savemat
 
 from greybox.errors import LogError
-from greybox.trial.readers import matfile
+from greybox.trial.readers import mat_process, matfile
 from greybox.trial.readers.mat import read_mat
 
 N = 50
 T = np.arange(N) * 0.1
 U = np.sin(T)
 START = 1_714_550_400.0  # 2024-05-01 08:00 UTC
+
+
+# tests of what a process of its own is there for; a copy of this one reads as it does
+OWN_PROCESS = {
+    "test_columns_rows_and_matrices", "test_sizes_stated_without_bytes_are_refused",
+    "test_a_file_that_needs_more_memory_than_it_may_is_refused",
+    "test_a_reader_that_takes_too_long_is_ended", "test_a_reader_that_crashes_is_damage",
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def forked(request, monkeypatch):
+    """Read in a copy of this process, which has imported SciPy already."""
+
+    def run(path, folder, bounds):
+        child = os.fork()
+        if not child:
+            try:
+                mat_process.main(str(path.resolve()), str(folder), json.dumps(asdict(bounds)))
+            finally:
+                os._exit(0)
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+    def restricted(most):
+        held = int(Path("/proc/self/statm").read_text().split()[0]) * mmap.PAGESIZE
+        bound(replace(most, process_bytes=held + most.process_bytes))
+
+    bound = mat_process._restrict
+    if request.function.__name__ not in OWN_PROCESS and Path("/proc/self/statm").exists():
+        monkeypatch.setattr(mat_process, "_run", run)
+        monkeypatch.setattr(mat_process, "_restrict", restricted)
 
 
 def put(group, name, value):
