@@ -54,6 +54,16 @@ def hasty():
         yield
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Pages of empty pictures: of what is read the figures hold nothing."""
+    monkeypatch.setattr("matplotlib.figure.Figure.get_layout_engine", lambda self: None)
+    monkeypatch.setattr(
+        "matplotlib.backends.backend_svg.FigureCanvasSVG.print_svg",
+        lambda self, out, **_: out.write("<svg></svg>"),
+    )
+
+
 @pytest.fixture(scope="session")
 def thesis():
     return get_structure("thesis")

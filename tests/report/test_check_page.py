@@ -324,6 +324,7 @@ def test_page_says_all_and_escapes_it(tmp_path):
     assert not re.search(r'(src|href)="(?!#)', without_scripts(html))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_what_logs_share_is_drawn_once_and_where_its_repair_does_not_help(tmp_path):
     one = tie_case("lever arm")
     shared = replace(one.findings[0], logs=("a", "b", "c"))

@@ -250,6 +250,7 @@ def test_none(pages, written, told):
     assert "before and after" not in pages["none"].lead.caption
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_whose_the_error_is_stands_in_bars_and_numbers(told):
     named = diagnosis_of("named")
     noise = NoiseLevels(("u", "v", "r"), np.full(3, 0.014), np.zeros(3), 0.0, 0.0, "test")
@@ -266,6 +267,7 @@ def test_whose_the_error_is_stands_in_bars_and_numbers(told):
     assert f"about surge {100 * (1 - 0.014 / surge.std()):.0f} %" in said
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_parts_that_do_not_add_up_are_said_to():
     budget = (*BUDGET[:-1], replace(BUDGET[-1], share={"u": 0.2, "v": 0.2, "r": -23.1}))
     named = replace(diagnosis_of("named"), budget=budget)
@@ -278,6 +280,7 @@ def test_parts_that_do_not_add_up_are_said_to():
     assert "  -2310.0 (" in shown
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_share_that_may_be_any_is_not_told():
     wide = {"u": (0.15, 0.25), "v": (-0.9, 1.0), "r": (-1.6, 1.8)}
     budget = (BUDGET[0], replace(BUDGET[1], ci=wide), BUDGET[2])
@@ -373,6 +376,7 @@ def test_the_command_that_errors_follow_is_shown(told):
     assert "by the command that it goes with most" in told["named"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_step_without_a_named_cause_says_so():
     named = diagnosis_of("named")
     told = [p.caption for p in diagnosis_page(named, RECORD).sections[1].pictures]
@@ -392,6 +396,7 @@ def test_only_what_the_verdict_names_is_bold(pages):
     assert "-Bold-42" not in partly
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_gain_beyond_the_terms_that_the_data_chose(pages):
     over = {"u": Gain(55.3, 61.4, (5.1, 7.1)), "v": Gain(-2e3, 61.4, (5.1, 7.1))}
     page = diagnosis_page(replace(diagnosis_of("named"), gain_over_chosen=over), RECORD)
@@ -402,6 +407,7 @@ def test_the_gain_beyond_the_terms_that_the_data_chose(pages):
     assert tables[1].rows[1][:4] == ["sway", "diverged", "61.4 %", ""]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_cause_that_is_there_or_not_has_no_number():
     held = replace(CURRENT, parameters={"interpolated": Quantity(1.0, 0.0, "1")})
     named = replace(diagnosis_of("named"), causes=(held,))
@@ -531,6 +537,7 @@ def test_in_a_browser(tmp_path, pages, verdict):
     require_legible(path, 390)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_many_causes_stand_by_their_titles_on_the_first_screen():
     one = diagnosis_of("named").causes[0]
     many = replace(diagnosis_of("partly"), causes=(one,) * 4)

@@ -115,6 +115,7 @@ def test_the_verdicts_stand_first(estimate, page, verdict, first):
     assert [row[0] for row in page.tables[0].rows] == ["surge", "sway", "yaw rate"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_free_run_is_told_of_as_many_logs_as_there_are(estimate, log, page):
     one = page.sections[0].sentences
     assert one[0].startswith("The model was fitted to this log, ")
@@ -146,6 +147,7 @@ def test_what_comes_next_of_a_model_of_surge_is_what_it_can_do():
     assert commands[-1] == "greybox predict MODEL stopping --report stopping.html"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_without_tests_the_page_stands(estimate, log):
     bare = estimation_page(replace(estimate, tests=(), notes=(), limits={}), [log], {})
     shown = render(bare)

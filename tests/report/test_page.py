@@ -84,6 +84,7 @@ def test_comparison_figure_has_labels_and_units(clean_log, thesis, true_theta):
     assert figure.axes[-1].get_xlabel() == "time from the first sample [s]"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_comparison_tells_of_gaps_and_of_runs_that_left(clean_log, thesis, true_theta):
     from greybox.model.model import ManoeuvringModel
     from greybox.report.comparison import comparison_page
