@@ -3,7 +3,7 @@
 A sequence by the clock asks of a ship that differs from the prior what it asks of the prior: each
 difference adds up over the trial. A leg that ends when the heading has changed by what the plan is
 about gives it back at its end. Which end serves a leg best is found by sailing it, in closed loop,
-under models drawn from the prior's uncertainty.
+under models drawn from the prior's uncertainty, moved by the forces that its misfit leaves open.
 """
 
 from __future__ import annotations
@@ -129,6 +129,8 @@ class LegPlan:
         Models that these were sailed under.
     assumed : bool
         Whether their scatter was assumed, the prior stating none.
+    misled : bool
+        Whether forces that the prior's misfit leaves open moved them too.
     """
 
     trials: tuple[tuple[Leg, ...], ...]
@@ -138,6 +140,7 @@ class LegPlan:
     off_by_clock: dict[str, float]
     draws: int
     assumed: bool
+    misled: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for the JSON of a design."""
@@ -159,6 +162,8 @@ class LegPlan:
             if self.assumed
             else "drawn from the prior"
         )
+        if self.misled:
+            models += " and the prior's misfit" if self.assumed else " and its misfit"
         said = (
             f"as legs, of which {kinds} end, the limits are kept with probability "
             f"{self.keeps_limits:.2f}, by the clock {self.by_clock:.2f}, under {models}"
@@ -192,10 +197,19 @@ def drawn_models(request: PreparedRequest, count: int, seed: int) -> Array:
 class _Way:
     """R models on their way through legs: what was commanded, and where each leg began."""
 
-    def __init__(self, rollout: Rollout, thetas: Array, schedule: Schedule, samples: int) -> None:
-        self.rollout, self.thetas, self.schedule = rollout, thetas, schedule
+    def __init__(
+        self,
+        rollout: Rollout,
+        thetas: Array,
+        schedule: Schedule,
+        samples: int,
+        off: Array | None = None,
+    ) -> None:
+        self.rollout, self.thetas, self.schedule, self.off = rollout, thetas, schedule, off
         runs = len(thetas)
         self.commands = np.zeros((runs, samples, len(schedule.commands)))
+        # the sample of the plan that each sample stands for
+        self.place: Samples = np.zeros((runs, samples + 1), np.intp)
         self.start: Samples = np.zeros(runs, np.intp)
         self.before: Array | None = None
 
@@ -209,19 +223,28 @@ class _Way:
         slow = self.schedule.ramp if self.schedule.limited else ()
         return max((_LEAST_SAMPLES, *slow))
 
-    def hold(self, level: Array, samples: int) -> Motion:
-        """Run to `samples` after the last start with `level` held from each start on."""
+    def hold(self, level: Array, samples: int, planned: tuple[int, int] = (0, 0)) -> Motion:
+        """Run to `samples` after the last start with `level` held from each start on.
+
+        The plan holds it from one of its samples to another, `planned`.
+        """
         last = min(int(self.start.max()) + samples, self.commands.shape[1])
         k = np.arange(last) - self.start[:, None]
         before = level if self.before is None else self.before
         share = np.clip((k[..., None] + 1) / np.array(self.schedule.ramp), 0.0, 1.0)
         held = before + share * (level - before)
         self.commands[:, :last] = np.where(k[..., None] >= 0, held, self.commands[:, :last])
-        return self.run(self.commands[:, :last])
+        since = np.arange(last + 1) - self.start[:, None]
+        there = np.minimum(planned[0] + since, planned[1])
+        self.place[:, : last + 1] = np.where(since >= 0, there, self.place[:, : last + 1])
+        return self.run(self.commands[:, :last], self.place[:, : last + 1])
 
-    def run(self, commands: Array) -> Motion:
-        """Run on commands (R, N, nc), lag and delay of the vessel included."""
-        return self.rollout.run_models(self.thetas, commands, late=True)
+    def run(self, commands: Array, place: Samples) -> Motion:
+        """Run on commands (R, N, nc), lag and delay included, at samples (R, N+1) of the plan."""
+        motion = self.rollout.run_models(self.thetas, commands, late=True)
+        if self.off is None:
+            return motion
+        return self.rollout.moved(motion, np.take_along_axis(self.off, place[..., None], axis=1))
 
     def turn_over(self, ends: Samples) -> None:
         """Begin the next leg where each model has ended this one."""
@@ -257,7 +280,12 @@ def _ends(leg: Leg, states: tuple[str, ...], motion: Motion, start: Samples, dt:
 
 
 def sail_legs(
-    rollout: Rollout, thetas: Array, legs: Sequence[Leg], schedule: Schedule
+    rollout: Rollout,
+    thetas: Array,
+    legs: Sequence[Leg],
+    schedule: Schedule,
+    off: Array | None = None,
+    planned: Sequence[int] = (),
 ) -> SailedLegs:
     """Sail legs in closed loop under several models at once.
 
@@ -273,17 +301,23 @@ def sail_legs(
     legs : sequence of Leg
     schedule : Schedule
         Of the plan.
+    off : ndarray, optional
+        (R, N+1, nx) by how much a misfit moves the states of each model along the plan.
+    planned : sequence of int
+        The samples at which the plan ends each leg; needed with `off`.
 
     Returns
     -------
     SailedLegs
     """
     dt, states = rollout.sample_time, rollout.structure.states
-    way = _Way(rollout, thetas, schedule, sum(round(leg.at_most / dt) for leg in legs) + 1)
+    samples = sum(round(leg.at_most / dt) for leg in legs) + 1
+    way = _Way(rollout, thetas, schedule, samples, off)
     ends = np.zeros((len(thetas), len(legs)), np.intp)
+    until = [0, *(planned if off is not None else [0] * len(legs))]
     for i, leg in enumerate(legs):
         level = np.array([leg.commands[n] for n in schedule.commands])
-        motion = way.hold(level, round(leg.at_most / dt))
+        motion = way.hold(level, round(leg.at_most / dt), (until[i], until[i + 1]))
         ends[:, i] = _ends(leg, states, motion, way.start, dt)
         way.turn_over(ends[:, i])
     return SailedLegs(motion, ends)
@@ -293,9 +327,10 @@ def legs_of(design: Design) -> LegPlan:
     """Return a plan as legs, each ended by what keeps its purpose best.
 
     Holds with equal commands are one leg. For each leg in turn its possible ends are sailed under
-    models drawn from the prior (see `drawn_models`), the legs before it as they were chosen and
-    the rest of the trial by the clock. Taken is the end after which the states scatter least
-    about the plan, relative to an end by the clock; the clock where nothing gains 10 %.
+    models drawn from the prior (see `drawn_models`) and its misfit, the legs before it as they
+    were chosen and the rest of the trial by the clock. Taken is the end after which the states
+    scatter least about the plan, relative to an end by the clock; the clock where nothing gains
+    10 %.
 
     Parameters
     ----------
@@ -318,11 +353,17 @@ def legs_of(design: Design) -> LegPlan:
     judged = drawn_models(r, _JUDGED, 4)
     for trial, commands in enumerate(design.commands):
         rollout = r.rollout(r.starts[trial])
-        legs = _chosen(design, trial, rollout)
+        chosen_off = judged_off = None
+        if r.misfit is not None:
+            drawn = r.misfit(rollout.run(commands[None]), _CHOICE + _JUDGED)
+            chosen_off, judged_off = drawn[:_CHOICE], drawn[_CHOICE:]
+        legs = _chosen(design, trial, rollout, chosen_off)
         trials.append(legs)
-        sailed = sail_legs(rollout, judged, legs, schedule)
-        clock = rollout.run_models(judged, commands, late=True)
         planned = planned_ends(design.levels[trial], schedule)[1]
+        sailed = sail_legs(rollout, judged, legs, schedule, judged_off, planned.tolist())
+        clock = rollout.run_models(judged, commands, late=True)
+        if judged_off is not None:
+            clock = rollout.moved(clock, judged_off)
         plan = design.motions[trial].state[0, planned]
         off.append(_scatter(r, sailed.at_ends()[sailed.motion.stable] - plan))
         off_clock.append(_scatter(r, clock.state[clock.stable][:, planned] - plan))
@@ -341,6 +382,7 @@ def legs_of(design: Design) -> LegPlan:
         dict(zip(names, np.sqrt(np.mean(np.square(off_clock), axis=0)).tolist(), strict=True)),
         _JUDGED,
         not r.uncertain,
+        r.misfit is not None,
     )
 
 
@@ -352,15 +394,20 @@ def planned_ends(levels: Array, schedule: Schedule) -> tuple[Samples, Samples]:
     return first, np.asarray(ends, np.intp)
 
 
-def _chosen(design: Design, trial: int, rollout: Rollout) -> tuple[Leg, ...]:
-    """Return the legs of one trial, chosen first to last."""
+def _chosen(design: Design, trial: int, rollout: Rollout, off: Array | None) -> tuple[Leg, ...]:
+    """Return the legs of one trial, chosen first to last.
+
+    A misfit moves the models along the plan by `off`, the first of them, the prior itself, not.
+    """
     r = design.request
     schedule, states, dt = r.schedule, r.structure.states, r.sample_time
     levels, plan = design.levels[trial], design.motions[trial].state[0]
     holds, planned = planned_ends(levels, schedule)
     thetas = drawn_models(r, _CHOICE, 3)
-    thetas = thetas[rollout.run_models(thetas, design.commands[trial], late=True).stable]
-    way = _Way(rollout, thetas, schedule, 2 * schedule.samples + 2 * len(holds))
+    stable = rollout.run_models(thetas, design.commands[trial], late=True).stable
+    if off is not None:
+        off = np.concatenate([0 * off[:1], off[1:]])[stable]
+    way = _Way(rollout, thetas[stable], schedule, 2 * schedule.samples + 2 * len(holds), off)
     begins = np.concatenate([[0], planned[:-1]])
     legs = []
     for hold, begin, end in zip(holds, begins, planned, strict=True):
@@ -369,7 +416,7 @@ def _chosen(design: Design, trial: int, rollout: Rollout) -> tuple[Leg, ...]:
         seconds = float((end - begin) * dt)
         by_clock = Leg(commands, "time", seconds, seconds, seconds)
         most = int(np.floor(_LATEST[1] * (end - begin)))
-        motion = way.hold(level, most)
+        motion = way.hold(level, most, (begin, end))
         options: list[tuple[Leg, Samples]] = []
         for leg in _ends_to_try(r, by_clock, plan, begin, end, way.earliest * dt, most * dt):
             ends = _ends(leg, states, motion, way.start, dt)
@@ -461,7 +508,13 @@ def _off(design: Design, trial: int, way: _Way, motion: Motion, ends: Samples, e
     width = min(way.commands.shape[1], len(k))
     so_far[:, :width] = way.commands[:, :width]
     after = (k >= ends[:, None])[..., None]
-    sailed = way.run(np.where(after, commands[place], so_far))
+    n = np.arange(len(k) + 1)
+    planned = np.clip(end + n - ends[:, None], 0, len(commands))
+    width = min(way.place.shape[1], len(n))
+    planned[:, :width] = np.where(
+        n[:width] >= ends[:, None], planned[:, :width], way.place[:, :width]
+    )
+    sailed = way.run(np.where(after, commands[place], so_far), planned)
     away = (sailed.state[runs, last] - plan[-1])[sailed.stable]
     return np.stack([here + seen, _scatter(r, away[:, None]) + seen])
 

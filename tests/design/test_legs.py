@@ -16,6 +16,7 @@ from schemas import schema
 from experiment_design.certificate.certificate import absent
 from experiment_design.constraints.limits import Circle, TrialLimits
 from experiment_design.excitation.rollout import Rollout
+from experiment_design.for_prediction import design_for_prediction
 from experiment_design.output.legs import Leg, drawn_models, legs_of, planned_ends, sail_legs
 from experiment_design.output.legs_file import csv_path, legs_path, legs_to_dict, write_legs
 from experiment_design.output.prediction import predict_motion
@@ -30,6 +31,7 @@ from experiment_design.output.sheet_contents import (
 from experiment_design.output.trial_sheet import write_sheet
 from experiment_design.prepare import both_sides, prepare_request
 from experiment_design.request.request import DesignRequest
+from greybox import estimate_model, read_log
 from greybox.commands.main import main
 from greybox.errors import UsageError
 from greybox.model.semi_empirical import semi_empirical_model
@@ -164,6 +166,47 @@ def test_legs_scatter_less_than_the_clock(tanker) -> None:
     assert not plan.assumed
 
 
+def test_a_misfit_moves_the_models_that_legs_are_chosen_and_judged_by(tanker) -> None:
+    design, exact = tanker
+
+    def misfit(motion, draws):
+        """A yaw rate that is off by 0.3 deg/s (standard deviation) throughout."""
+        off = np.zeros((draws, *motion.state.shape[1:2], 3))
+        off[..., 2] = np.deg2rad(0.3) * np.random.default_rng(1).standard_normal((draws, 1))
+        return off
+
+    plan = legs_of(replace(design, request=replace(design.request, misfit=misfit)))
+    ends = planned_ends(design.levels[0], design.request.schedule)[1] * design.request.sample_time
+    # by the clock the heading drifts from end to end, on top of what the coefficients do
+    expected = np.deg2rad(0.3) * np.sqrt(np.mean(ends**2))
+    drift = np.sqrt(plan.off_by_clock["psi"] ** 2 - exact.off_by_clock["psi"] ** 2)
+    # the standard deviation of 200 draws is known to 5 %
+    assert drift == pytest.approx(expected, rel=0.2)
+    assert plan.trials != exact.trials
+    assert "under 200 models drawn from the prior and its misfit" in plan.sentence()
+    assert "misfit" not in exact.sentence()
+
+
+@pytest.mark.long
+def test_under_a_misfit_a_foreign_ship_keeps_a_plan_for_prediction_by_legs(tmp_path) -> None:
+    preset = presets()["kvlcc2-7m"]
+    (tmp_path / "ship.toml").write_text(preset.ship.vessel_toml())
+    vessel = load_vessel(tmp_path / "ship.toml")
+    steps = manoeuvres.random_steps(hold=(0.5, 2.0))
+    preset.sail(steps, 356.0, seed=6100).write_csv(tmp_path / "first.csv", 5)
+    model = estimate_model(read_log(tmp_path / "first.csv", vessel)).model()
+    asked = DesignRequest(duration=300.0, limits=TrialLimits(), effort=0.3)
+    request = prepare_request(model, both_sides(asked, model), vessel)
+    design = design_for_prediction(request, model).design.from_first_command()
+    plan = legs_of(design)
+    blind = legs_of(replace(design, request=replace(design.request, misfit=None)))
+    by_legs, by_clock = heading_off(design, plan)
+    assert by_legs < 0.6 * by_clock
+    assert by_legs < heading_off(design, blind)[0]
+    # what is said of the clock holds for this ship, too
+    assert by_clock < 2 * np.rad2deg(plan.off_by_clock["psi"])
+
+
 def steered(legs):
     """Sail the JSON's legs on a ship that knows nothing of the product; times of their ends."""
     ended: list[tuple[float, float]] = []
@@ -204,11 +247,13 @@ def heading_off(design, plan):
     """RMS distance [deg] from the plan at ends of legs on the foreign tanker, legs and clock."""
     legs = json.loads(json.dumps(legs_to_dict(design, plan)))["legs"]
     preset, dt = presets()["kvlcc2-7m"], design.request.sample_time
-    where = {"start_speed": 0.9, "start_heading": 0.0, "seed": 1}
+    where = {"start_speed": float(design.request.starts[0][0]), "start_heading": 0.0, "seed": 1}
     manoeuvre, ended = steered(legs)
     preset.sail(manoeuvre, sum(leg["at_most"] for leg in legs), **where)
     times = np.arange(len(design.commands[0])) * dt
-    clock = preset.sail(manoeuvres.table(times, design.commands[0].tolist()), 180.0, **where)
+    clock = preset.sail(
+        manoeuvres.table(times, design.commands[0].tolist()), float(times[-1]) + dt, **where
+    )
     ends = planned_ends(design.levels[0], design.request.schedule)[1]
     by_clock = np.interp(ends * dt, clock.t, np.unwrap(clock.true["psi"]))
     by_legs = np.array([psi for _, psi in ended[: len(legs)]])
