@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import time
 
 # two test processes on two cores: threads of BLAS would only wait for each other
@@ -103,6 +104,12 @@ def noisy_log():
     return virtual_log(2, 5000)
 
 
+@pytest.fixture(scope="session")
+def noisy_file(noisy_log, tmp_path_factory):
+    return write_csv(noisy_log.window(0, 2000), tmp_path_factory.mktemp("noisy") / "trial.csv")
+
+
 @pytest.fixture
-def noisy_csv(noisy_log, tmp_path):
-    return write_csv(noisy_log, tmp_path / "trial.csv")
+def noisy_csv(noisy_file, tmp_path):
+    """The first 2000 s of the noisy log, as a file of the test's own."""
+    return Path(shutil.copy(noisy_file, tmp_path))
