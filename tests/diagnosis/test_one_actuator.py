@@ -145,6 +145,14 @@ def test_a_limit_makes_movements_late_by_more_than_sampling_does() -> None:
     assert time.least == pytest.approx(1.0 + 2 * 0.75)
 
 
+@pytest.mark.parametrize("cause", ["thruster_lag", "input_delay"])
+def test_a_lag_of_a_third_of_a_sample_is_more_than_sampling_makes(cause: str) -> None:
+    # logged every second: what moves between samples acts half a sample earlier, never later
+    for hypothesis in hypotheses(vessel(RUDDER), cause).values():
+        (time,) = hypothesis.parameters
+        assert time.least == pytest.approx(0.25)
+
+
 def test_a_cause_held_at_its_value_is_in_force_and_lets_no_other_of_its_kind_in() -> None:
     ship = Ship(np.zeros(1), np.zeros(2), vessel(RUDDER))
     lags = hypotheses(ship.vessel, "thruster_lag")

@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 
 # slowest thruster and longest delay that are looked for, as shares of a log and in seconds
 _SHARE, _LONGEST = 0.1, 120.0
+# samples by which a lag or a delay is told beyond sampling: a command that moves between samples
+# acts half of one earlier than one that is held, never later
+_RESOLVED = UNRESOLVED - 0.5
 # standard deviation of what lies anywhere within half a sample, in samples
 _HALF = 0.5 / 3**0.5
 # strongest thrusters beside the others'; shares of the fastest logged movement from which a
@@ -176,7 +179,7 @@ class ThrusterLag(Cause):
             start, *others = _times(own, first, (4,))
             parameter = Parameter(
                 "lag", "s", start, 1e-3, longest, own, step=1e-3,
-                least=UNRESOLVED * context.sample_time,
+                least=_RESOLVED * context.sample_time,
             )  # fmt: skip
             return Hypothesis(
                 self.id, f"{self.id}:{on}", (parameter,), (), apply,
@@ -235,7 +238,7 @@ class InputDelay(Cause):
             start, *others = _times(own, first, (3, 6))
             parameter = Parameter(
                 "delay", "s", start, 0.0, longest, own, step=0.1 * context.sample_time,
-                least=UNRESOLVED * context.sample_time, coarse=coarse,
+                least=_RESOLVED * context.sample_time, coarse=coarse,
             )  # fmt: skip
             return Hypothesis(
                 self.id, key, (parameter,), (), apply, starts=tuple((t,) for t in others),
