@@ -23,15 +23,6 @@ from greybox.trial.readers.limits import Limits
 from greybox.vessel.toml import load_vessel
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items):
-    """Begin the long tests at another one each time: where some are left out, they are others."""
-    until = os.environ.get("LONG_TESTS_UNTIL")
-    if until and items:
-        first = int(until) % len(items)
-        items[:] = items[first:] + items[:first]
-
-
 def pytest_collection_finish():
     """Leave out what stays until the end, tests and libraries, whenever garbage is looked for."""
     gc.collect()
