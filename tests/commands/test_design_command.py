@@ -64,7 +64,6 @@ def designed(folder):
     return plan.read_bytes(), json.loads(out.read_text())
 
 
-@pytest.mark.usefixtures("hasty")
 def test_plan_and_json(folder, capsys):
     out = folder / "design.json"
     status, plan = run(

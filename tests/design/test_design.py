@@ -154,7 +154,6 @@ def test_each_trial_tells_its_steady_start():
     assert note.startswith("trial 2 starts from a steady motion: u ")
 
 
-@pytest.mark.usefixtures("hasty")
 def test_a_locked_thruster_has_equal_limits():
     request = make_request(
         structure="surge", vessel=limited_ship(angles=(0.8, 0.8)), effort=0.05, duration=150.0
@@ -623,7 +622,6 @@ def good():
     return design_trial(make_request(duration=120.0, effort=0.1), workers=1, alternatives=False)
 
 
-@pytest.mark.usefixtures("hasty")
 def test_a_design_starts_from_what_it_is_given(good):
     request = make_request(duration=120.0, effort=0.02)
     again = design_trial(request, workers=1, alternatives=False, first=good.levels)

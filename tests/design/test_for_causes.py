@@ -216,7 +216,6 @@ def test_a_plan_tells_more_than_random_and_usual_trials(found) -> None:
     assert found.design.motions[0].state[0, :, 0].min() > 0.2 - 1e-3
 
 
-@pytest.mark.usefixtures("hasty")
 def test_the_command(tmp_path, model, capsys) -> None:
     ship, prior, plan = tmp_path / "ship.toml", tmp_path / "model.json", tmp_path / "plan.csv"
     ship.write_text(ship_file(-1.1, "heading_std = 0.01"))

@@ -405,7 +405,6 @@ def files(tmp_path_factory):
     return place
 
 
-@pytest.mark.usefixtures("hasty")
 def test_the_command(files, capsys: pytest.CaptureFixture[str]) -> None:
     plan = files / "plan.csv"
     asked = ["design", "--vessel", str(files / "ship.toml"), "--model", str(files / "model.json"),
