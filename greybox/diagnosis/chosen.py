@@ -192,9 +192,10 @@ def _start(
     chosen = choice.terms.structure.parameters
     free = dict.fromkeys((*chosen, *_replaced(ready.structure, named)))
     places = tuple(problem.place(n) for n in free if n not in in_force)
-    start = Point(_ship(problem, choice, base), base.point.starts, places)
+    share, pushed = _law(choice, base, named)
+    start = Point(_ship(problem, choice, base, pushed), base.point.starts, places)
     for hypothesis in named:
-        value = None if hypothesis.apply is None else np.array([_share(choice)])
+        value = None if hypothesis.apply is None else np.array([share])
         start = problem.add(start, hypothesis, value)
     spare = [problem.place(n) for n in free if n not in in_force and n not in chosen]
     return _told_apart(problem, start, base.noise, spare)
@@ -428,17 +429,11 @@ def _cause_of(term: Term, structure: Structure, vessel: Vessel) -> str | None:
     return None
 
 
-def _share(choice: TermChoice) -> float:
-    law = choice.logs[0].vessel.thrusters[0].thrust
-    return 1.0 if law.kind == "quadratic" else law.quadratic_share
-
-
-def _ship(problem: Problem, choice: TermChoice, base: Fit) -> Ship:
+def _ship(problem: Problem, choice: TermChoice, base: Fit, pushed: float) -> Ship:
     """Return the chosen coefficients at the sample time and thrust of the diagnosis."""
     terms = choice.terms
     ship = base.point.base
     scale = problem.sample_time / choice.logs[0].sample_time
-    pushed = _push(choice, base)
     theta = np.zeros(len(ship.theta))
     for term, value in zip(terms.structure.terms, terms.start, strict=True):
         of_thrust = any(f.signal in problem.structure.inputs for f in term.factors)
@@ -446,10 +441,15 @@ def _ship(problem: Problem, choice: TermChoice, base: Fit) -> Ship:
     return replace(ship, theta=theta, current=np.zeros(len(CURRENTS)))
 
 
-def _push(choice: TermChoice, base: Fit) -> float:
-    """Return the chosen law's force in that of the diagnosis's, where n|n| is over a reference."""
-    law = choice.logs[0].vessel.thrusters[0].thrust
-    own = base.point.base.vessel
-    if law == own.thrusters[0].thrust or law.kind != "quadratic":
-        return 1.0
-    return float(np.mean([np.median(np.abs(choice.logs[0][t.speed])) for t in own.thrusters]))
+def _law(choice: TermChoice, base: Fit, named: Sequence[Hypothesis]) -> tuple[float, float]:
+    """Return the share of n|n| of the chosen law, and its force over that of the diagnosis.
+
+    Both count the share at a typical speed of their own.
+    """
+    apply = next((a.apply for a in named if a.cause == _QUADRATIC), None)
+    if apply is None:
+        return 0.0, 1.0
+    reference = apply(base.point.base, np.ones(1)).vessel.thrusters[0].thrust.reference
+    straight, squared = choice.logs[0].vessel.thrusters[0].thrust.shares
+    pushed = straight + squared * reference
+    return squared * reference / pushed, pushed

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from math import inf
 
 import numpy as np
 
@@ -171,7 +172,8 @@ def diagnose(
             if chosen is not None:
                 wider, mine = chosen
                 mine = weighed(wider, mine)
-                if mine.causes or not found.causes:
+                # many a cause keeps a run within bounds: that alone outweighs no better model
+                if mine.causes or not any(c.proof.gain < inf for c in found.causes):
                     case, found = wider, mine
                     problem = case.problem(found.base.integrator)
     say("what is left")

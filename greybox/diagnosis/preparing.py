@@ -25,6 +25,7 @@ from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import whole_name
 from greybox.vessel.force import force_inputs
+from greybox.vessel.thrust import typical_speed
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -259,7 +260,8 @@ def _context(
     together: frozenset[str],
 ) -> Context:
     first = logs[0]
-    speeds = {t.speed: _turning([log[t.speed] for log in logs]) for t in first.vessel.thrusters}
+    driven = [t.speed for t in first.vessel.thrusters]
+    speeds = {c: typical_speed([log[c] for log in logs]) for c in driven}
     logs = [*logs, *validate]
     moved = {c: [log[c] for log in logs] for c in first.vessel.commands}
     turns = "r" in structure.states and all("psi" in log for log in logs)
@@ -302,12 +304,6 @@ def _passage(logs: Sequence[TrialLog]) -> float:
         return 0.0
     speed = float(np.sqrt(np.mean(np.concatenate([log["u"] for log in logs]) ** 2)))
     return logs[0].vessel.length / max(speed, 1e-9)
-
-
-def _turning(speeds: Sequence[Array]) -> float:
-    """Return the typical size of a propeller speed, of all samples (N,) in which it turns."""
-    sizes = np.abs(np.concatenate(speeds))
-    return float(np.median(sizes[sizes > 0])) if sizes.any() else 0.0
 
 
 def _case(

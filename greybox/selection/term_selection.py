@@ -31,7 +31,7 @@ from greybox.selection.held_out import extent, folds, rank, spread_of
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
 from greybox.vessel.force import force_inputs
-from greybox.vessel.thrust import ThrustLaw
+from greybox.vessel.thrust import ThrustLaw, typical_speed
 from greybox.vessel.vessel import Between
 
 Array = NDArray[np.float64]
@@ -484,7 +484,7 @@ def _laws(logs: Sequence[TrialLog]) -> list[ThrustLaw]:
     if any(t.thrust != ThrustLaw() for t in vessel.thrusters):
         return [own]
     speeds = [np.concatenate([log[t.speed] for log in logs]) for t in vessel.thrusters]
-    usual = [float(np.sqrt(np.mean(n**2))) for n in speeds]
+    usual = [typical_speed([n]) for n in speeds]
     if not any(np.std(np.abs(n)) > _VARIES * u for n, u in zip(speeds, usual, strict=True)):
         return [own]
     reference = float(np.max(usual))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from greybox.study.blind_inputs import RATES
 from greybox.study.blind_ship import EXTRA, LEAD, NAMES, Ship
+from greybox.vessel.thrust import typical_speed
 
 Array = NDArray[np.float64]
 Value = float | str
@@ -176,9 +177,9 @@ def _unheld(rng: np.random.Generator, size: float, typical: Typical) -> dict[str
 
 
 def _quadratic(rng: np.random.Generator, size: float, typical: Typical) -> dict[str, Value]:
-    speed = np.abs(typical.commands[:, :2])
-    # the share is counted at the propellers' middle speed, as the cause counts it
-    return {"quadratic_share": size, "reference": float(np.median(speed, axis=0).mean())}
+    # the share is counted at the propellers' typical speed, as the cause counts it
+    reference = float(np.mean([typical_speed([n]) for n in typical.commands[:, :2].T]))
+    return {"quadratic_share": size, "reference": reference}
 
 
 def _relative(*names: str) -> Draw:

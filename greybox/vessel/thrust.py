@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Literal
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 from greybox.errors import VesselError
 
@@ -70,7 +73,9 @@ class ThrustLaw:
 
     @property
     def shares(self) -> tuple[float, float]:
-        """What of a linear law goes with n, and what with n|n|."""
+        """What of the force goes with n, and what with n|n|, where the law is no table."""
+        if self.kind == "quadratic":
+            return 0.0, 1.0
         return 1 - self.quadratic_share, self.quadratic_share / self.reference
 
     @property
@@ -98,3 +103,12 @@ class ThrustLaw:
             if after != before:
                 force = force + (after - before) * ca.fmax(speed - n, 0)
         return force
+
+
+def typical_speed(logged: Sequence[NDArray[np.float64]]) -> float:
+    """Return the root mean square of a propeller's speed in several logs, each (N,).
+
+    A propeller that idles for most of a log turns slowly there, and at no typical speed: a median
+    would be that of idling.
+    """
+    return float(np.sqrt(np.mean(np.concatenate(logged) ** 2)))

@@ -4,19 +4,28 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import factorial
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from greybox.diagnosis.builder import at_limit
 from greybox.diagnosis.causes.sensors import LeverArm, abeam, alike_to_forces, turned_alike
-from greybox.diagnosis.chosen import _known_columns, _own_share, _told_apart, _with_sensors
+from greybox.diagnosis.chosen import (
+    _known_columns,
+    _law,
+    _own_share,
+    _told_apart,
+    _with_sensors,
+)
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.search import Candidate, _of_the_ship
 from greybox.model.run.step import MONOTONE, Integrator
 from greybox.study.blind import draw
 from greybox.trial.log import TrialLog
+from greybox.vessel.thrust import ThrustLaw
 
 BIAS, ARM = 0.06, (-0.9, 0.4)
 
@@ -162,3 +171,22 @@ def test_a_compass_bias_and_a_force_to_one_side_are_rivals() -> None:
     assert turned_alike(of("side_force"), of("heading_bias"))
     assert not turned_alike(of("asymmetry"), of("side_force"))
     assert not turned_alike(of("heading_bias"), of("lever_arm"))
+
+
+@pytest.mark.parametrize("law", [ThrustLaw(quadratic_share=0.5, reference=12.0),
+                                 ThrustLaw("quadratic"), ThrustLaw()])  # fmt: skip
+def test_a_chosen_thrust_law_keeps_its_force(law: ThrustLaw) -> None:
+    trial = draw(np.random.default_rng([4, 2]), (), samples=200, positions=False)
+    ready = prepare([trial.estimation], [trial.validation], None, "thesis", ["quadratic_thrust"])
+    base = ready.base()
+    vessel = trial.estimation.vessel
+    thrusters = tuple(replace(t, thrust=law) for t in vessel.thrusters)
+    log = replace(trial.estimation, vessel=replace(vessel, thrusters=thrusters))
+    share, pushed = _law(cast(Any, SimpleNamespace(logs=[log])), base, ready.hypotheses)
+    apply = ready.hypotheses[0].apply
+    assert apply is not None
+    ours = apply(base.point.base, np.array([share])).vessel.thrusters[0].thrust
+    assert ours.reference != law.reference
+    speeds = np.array([-14.0, 3.0, 20.0])
+    for n in speeds:
+        assert pushed * float(ours.force(n)) == pytest.approx(float(law.force(n)))

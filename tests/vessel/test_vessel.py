@@ -15,7 +15,7 @@ from greybox.errors import VesselError
 from greybox.trial.log import make_log
 from greybox.vessel.actuation import Actuation, actuated_force, limited
 from greybox.vessel.force import force_expressions, force_inputs, generalised_force
-from greybox.vessel.thrust import ThrustLaw
+from greybox.vessel.thrust import ThrustLaw, typical_speed
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
 from greybox.vessel.vessel import ColumnMapping, Thruster
 
@@ -415,3 +415,8 @@ def test_help_and_models_in_code_need_no_schema_library():
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
     assert b"greybox.vessel.toml" in loaded.stdout
     assert b"pydantic" not in loaded.stdout
+
+
+def test_a_propeller_that_idles_for_most_of_its_logs_is_typically_as_fast_as_when_it_pushes():
+    idle, at_work = np.full(900, 0.07), np.tile([30.0, -30.0], 50)
+    assert typical_speed([idle, at_work]) == pytest.approx(30 / math.sqrt(10), rel=1e-3)
