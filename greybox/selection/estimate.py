@@ -72,8 +72,9 @@ from greybox.vessel.force import force_inputs
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
-# share of length over speed that a sample may take
-_SHARE = 0.05
+# share of length over speed that a sample may take, and samples that logs keep at least: a ship
+# that hardly moves is pushed about by thrusters that do not wait for her
+_SHARE, _KEPT = 0.05, 500
 # shares of the time that is left that output error may take beside a regression, and the
 # selection of terms, so that their estimate ends too; share of all that the verdict may
 _FOR_FREE_RUN, _FOR_TERMS, _FOR_VERDICT = 0.3, 0.7, 0.25
@@ -401,7 +402,7 @@ def at_own_pace(
     """Return logs at a sample time that suits how fast the ship moves; `notes` are told.
 
     A ship answers in times of the order of its length over its speed: a twentieth of that
-    shows all of it, and more samples hold sensor noise and cost time.
+    shows all of it, and more samples hold sensor noise and cost time. Few samples cost none.
 
     Parameters
     ----------
@@ -416,7 +417,8 @@ def at_own_pace(
         return logs
     speed = float(np.sqrt(np.mean(np.concatenate(speeds) ** 2)))
     length, own = logs[0].vessel.length, logs[0].sample_time
-    times = int(share * length / speed / own) if speed > 0 else 1
+    most = sum(map(len, logs)) // _KEPT
+    times = min(int(share * length / speed / own), most) if speed > 0 else 1
     if times < 2:
         return logs
     try:
@@ -425,7 +427,8 @@ def at_own_pace(
         return logs
     notes.append(
         f"the logs were taken at {times * own:g} s instead of {own:g} s, the next multiple below "
-        f"{share:g} of length over speed ({length:g} m, {speed:.3g} m/s); --sample-time sets it."
+        f"{share:g} of length over speed ({length:g} m, {speed:.3g} m/s)"
+        f"{f' that keeps {_KEPT} samples' if times == most else ''}; --sample-time sets it."
     )
     notes += left_out
     return slower

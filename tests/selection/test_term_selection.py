@@ -177,13 +177,18 @@ def test_logs_are_taken_at_the_pace_of_the_ship():
     vessel = vessel_from_dict(
         {"name": "boat", "length": 10.0, "thruster": [{"type": "fixed", "speed": "n"}]}
     )
-    count = 400
+    count = 2000
     channels = dict.fromkeys(("v", "r", "psi"), np.zeros(count))
     channels |= {"u": np.full(count, 2.0), "n": np.ones(count)}
     notes: list[str] = []
     (slower,) = at_own_pace([make_log(vessel, channels, 0.1)], notes)
     assert slower.sample_time == pytest.approx(0.2)  # at most a twentieth of 10 m over 2 m/s
     assert "0.2 s instead of 0.1 s" in notes[0]
+    notes.clear()
+    # thrusters that push a ship about on her place do not wait for her
+    (still,) = at_own_pace([make_log(vessel, channels | {"u": channels["u"] / 40}, 0.1)], notes)
+    assert still.sample_time == pytest.approx(0.4)
+    assert "that keeps 500 samples" in notes[0]
     notes.clear()
     same = [make_log(vessel, channels, 0.2)]
     assert at_own_pace(same, notes) is same
