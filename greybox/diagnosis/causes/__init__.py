@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.causes.change import ParameterChange
-from greybox.diagnosis.causes.flow import Current, Wind
+from greybox.diagnosis.causes.flow import Current, Waves, Wind
 from greybox.diagnosis.causes.hull import (
     Asymmetry,
     Crossflow,
@@ -13,7 +13,6 @@ from greybox.diagnosis.causes.hull import (
     QuadraticYawDamping,
     SideForce,
 )
-from greybox.diagnosis.causes.motion import Waves
 from greybox.diagnosis.causes.sensors import (
     ClockOffset,
     HeadingBias,
