@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -49,7 +50,15 @@ class Contents(DisplayMixin):
 
     def summary(self) -> str:
         """Return manoeuvres and regimes as text; empty where there is nothing to tell."""
-        parts = [m.summary() for m in self.manoeuvres]
+        told = [m.summary().splitlines() for m in self.manoeuvres]
+        of = Counter(
+            line
+            for lines in told
+            for line in lines
+            if line.startswith("  note: ") or Compliance.NOT_APPLICABLE.value in line
+        )
+        parts = ["\n".join(x for x in lines if of[x] < 2) for lines in told]
+        parts += [f"of {n} manoeuvres: {x.strip()}" for x, n in of.items() if n > 1]
         if self.regimes and self.seconds > 0:
             said = ", ".join(
                 f"{name} {100 * s / self.seconds:.0f} %"

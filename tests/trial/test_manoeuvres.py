@@ -34,7 +34,7 @@ from greybox.trial.manoeuvres.standards import (
 )
 from greybox.trial.manoeuvres.track import make_track, path_length
 from greybox.trial.steps import Step
-from greybox.trial.trial_summary import describe_logs
+from greybox.trial.trial_summary import Contents, describe_logs
 from greybox.vessel.toml import vessel_from_dict
 
 DEG = math.pi / 180
@@ -213,6 +213,10 @@ def test_a_drifting_circle_is_told_from_its_drift():
         t, x, y, psi, speed + 0.4 * c - 0.3 * s, -0.4 * s - 0.3 * c, start=60, length=100
     )
     assert turn.final_diameter.value == pytest.approx(2 * radius, rel=1e-6)
+    # what two turns have in common is told once
+    told = Contents((turn, turn)).summary()
+    assert told.count("IMO ") == told.count("not applicable") == 1
+    assert "of 2 manoeuvres: IMO advance and tactical diameter: not applicable, because" in told
     assert turn.set_north.value == pytest.approx(0.4, abs=1e-6)
     assert turn.set_east.value == pytest.approx(-0.3, abs=1e-6)
     assert turn.speed.value == pytest.approx(speed, rel=1e-6)
@@ -240,6 +244,10 @@ def test_zigzag_of_a_simulated_ship(zigzag_run, zigzag_truth):
     assert z.label == "zig-zag 20/20, first to starboard"
     assert z.period.value == pytest.approx(executes[3] - executes[1])
     assert "IMO first overshoot, at most 25.0 deg: pass" in z.summary()
+    longer = replace(z, overshoots=z.overshoots[:1] * 4, check_times=z.check_times[:1] * 4)
+    lowest = f"{math.degrees(z.overshoots[0].value):.1f}"
+    assert f"note: overshoots 3 to 4: {lowest} to {lowest} deg" in longer.summary()
+    assert "overshoot 3 " not in longer.summary()
 
 
 def test_a_stop_on_a_straight_line():

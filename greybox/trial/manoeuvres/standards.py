@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from greybox.trial.manoeuvres.quantity import Quantity
@@ -72,7 +72,10 @@ def as_text(
 ) -> str:
     """Return a manoeuvre as text: quantities that were measured, verdicts and notes."""
     lines = [f"  {n:<20}{q.text(length)}" for n, q in rows if q is not None]
-    lines += [f"  IMO {c.summary()}" for c in criteria]
+    alike: dict[Criterion, list[str]] = {}
+    for c in criteria:
+        alike.setdefault(replace(c, name="") if c.limit is None else c, []).append(c.name)
+    lines += [f"  IMO {replace(c, name=' and '.join(n)).summary()}" for c, n in alike.items()]
     return "\n".join([head, *lines, *(f"  note: {n}" for n in notes)])
 
 

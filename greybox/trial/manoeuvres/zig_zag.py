@@ -29,6 +29,8 @@ from greybox.trial.raw_log import Array
 
 _TEN = math.radians(10)
 _FIVE = math.radians(5)
+# overshoots that the summary tells one by one, as the standard judges no others
+_TOLD = 2
 # how far rudder and heading may be from the nominal angles of a test [rad]
 _RUDDER_NEAR, _HEADING_NEAR = math.radians(1.0), math.radians(1.6)
 
@@ -111,7 +113,8 @@ class ZigZag(DisplayMixin):
         """Return the measured values, verdicts and notes as text."""
         where = f"from {self.start:.1f} to {self.stop:.1f} s, {len(self.executes)} executes"
         rows: list[tuple[str, Quantity | None]] = [("approach speed", self.approach_speed)]
-        for i, (angle, time) in enumerate(zip(self.overshoots, self.check_times, strict=True)):
+        checks = list(zip(self.overshoots, self.check_times, strict=True))
+        for i, (angle, time) in enumerate(checks[:_TOLD]):
             rows += [(f"overshoot {i + 1}", angle), (f"  time to check {i + 1}", time)]
         change = f"{math.degrees(self.initial_turning_angle):.0f} deg"
         rows += [
@@ -120,7 +123,14 @@ class ZigZag(DisplayMixin):
             ("reach", self.reach),
             ("period", self.period),
         ]
-        return as_text(f"{self.label}, {where}", rows, self.length, self.criteria, self.notes)
+        later = [math.degrees(angle.value) for angle, _ in checks[_TOLD:]]
+        more = (
+            [f"overshoots {_TOLD + 1} to {len(checks)}: {min(later):.1f} to {max(later):.1f} deg"]
+            if later
+            else []
+        )
+        notes = (*more, *self.notes)
+        return as_text(f"{self.label}, {where}", rows, self.length, self.criteria, notes)
 
 
 def measure_zigzag(
