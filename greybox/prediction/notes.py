@@ -76,9 +76,12 @@ def run_notes(
     forces = late.lag > 0 and late.lag_on == "force"
     instant = [n for n in names if rates[n] is None and n not in slow and not forces]
     if instant:
+        moved = ((k, c) for t in model.vessel.thrusters for k, c, _, _ in t.movements)
+        keys = dict.fromkeys(f"{kind}_rate" for kind, column in moved if column in instant)
         told.append(
-            f"the vessel file states no rate of {', '.join(instant)}, so orders are carried out "
-            f"at once: add it where the trial's helm takes time."
+            f"{', '.join(instant)} {'follow' if len(instant) > 1 else 'follows'} orders at once, "
+            f"because the vessel file states no {' or '.join(keys)}: state it, or a ship whose "
+            f"helm takes time is predicted to answer too early."
         )
     if isinstance(own, TurningCircle | ZigZag) and own.direction * task.sign < 0:
         told.append(

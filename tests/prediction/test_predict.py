@@ -134,7 +134,10 @@ def test_orders_are_not_said_to_act_at_once_where_the_model_delays_them(actuatio
     made = predict_manoeuvre(
         rudder_model(actuation=actuation), "zigzag", side="port", angles=[0.3], **FEW
     )
-    assert ("no rate of delta, so orders are carried out at once" in made.summary()) == instant
+    assert (
+        "delta follows orders at once, because the vessel file states no rudder_rate"
+        in made.summary()
+    ) == instant
 
 
 @pytest.mark.parametrize("kind", ["turning", "zigzag", "crash"])
