@@ -27,7 +27,7 @@ __all__ = [
 ]  # fmt: skip
 
 # endings that name a format
-_ENDINGS = (".csv", ".parquet", ".pq", ".json", ".toml", ".html")
+_ENDINGS = (".csv", ".parquet", ".pq", ".json", ".toml", ".html", ".pdf", ".png", ".svg")
 # GiB that logs and what is made of them may take by default, those of a usual machine
 _MEMORY = 4.0
 VESSEL_HELP = "vessel file (TOML), as 'greybox import --help' shows one, or thesis or ferry"
@@ -199,8 +199,8 @@ def read_logs(
     return logs, (*misnamed, *told, *left_out)
 
 
-def require_ending(path: str | None, ending: str, what: str) -> None:
-    """Raise where what --out writes would have the ending of another format.
+def require_ending(path: str | None, ending: str, what: str, option: str = "--out") -> None:
+    """Raise where what an option writes would have the ending of another format.
 
     Raises
     ------
@@ -211,8 +211,8 @@ def require_ending(path: str | None, ending: str, what: str) -> None:
 
     if path is not None and Path(path).suffix.casefold() in {*_ENDINGS} - {ending}:
         raise UsageError(
-            f"--out names '{path}', and {what} is {ending[1:].upper()}: name a file that ends in "
-            f"{ending}."
+            f"{option} names '{path}', and {what} is {ending[1:].upper()}: name a file that ends "
+            f"in {ending}."
         )
 
 
@@ -303,6 +303,7 @@ def require_apart(options: argparse.Namespace) -> None:
     """
     from greybox.errors import UsageError
 
+    require_ending(getattr(options, "report", None), ".html", "a page", "--report")
     taken: dict[Path, str] = {}
     for name in _INPUTS:
         paths = _paths(getattr(options, name, None))

@@ -198,7 +198,8 @@ def run(options: argparse.Namespace) -> None:
         written = ", ".join(str(log) for log in logs)
         beside = "its record" if len(logs) == 1 else "their records"
         say(f"wrote {written} and {record_path(logs[0]).name if not folder else beside}")
-        lacking = [c for c in vessel.commands if any(c not in r["units"] for r in records)]
+        needed = ("psi", *vessel.commands)
+        lacking = [c for c in needed if any(c not in r["units"] for r in records)]
         show_next([after_import(options.out, options.vessel, lacking)])
 
 

@@ -70,7 +70,7 @@ def build_parser(only: str | None = None) -> Parser:
         told = {"help": module.HELP, "description": module.HELP, "epilog": module.EXAMPLES}
         sub = commands.add_parser(name, **told)
         module.add_arguments(sub)
-        sub.usage = sub.short_usage()
+        sub.usage, sub.whole = sub.short_usage(), build_parser
         _add_shell(sub.add_argument_group("output and configuration"), "more_verbose")
         sub.set_defaults(run=module.run)
     topic = commands.add_parser("help", help="show the help of a command", add_help=False)
@@ -89,9 +89,9 @@ def _parse(given: list[str]) -> argparse.Namespace:
         parser.print_help(sys.stderr)
         parser.exit(2)
     parsers = sub_parsers(parser)
+    before = parser.for_parts().parse_args(given[:at])
     if command not in parsers:
         return parser.parse_args(given)
-    before = parser.for_parts().parse_args(given[:at])
     typed = vars(parsers[command].for_parts().parse_args(given[at + 1 :]))
     try:
         folder = Path.cwd()
@@ -138,21 +138,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if "_ARGCOMPLETE" in os.environ:
         offer(build_parser())
-    name, vessel = "greybox", "V"
+    name, options = "greybox", argparse.Namespace()
     _open_streams()
     try:
         given = list(sys.argv[1:] if arguments is None else arguments)
         try:
             _require_utf8(given)
             options = _parse(given)
-            name, vessel = f"greybox {options.command}", getattr(options, "vessel", None) or "V"
+            name = f"greybox {options.command}"
             with telling(options.verbose + getattr(options, "more_verbose", 0), options.quiet):
                 _run(options)
         finally:
             # what a full disk refuses is told here, and not when the interpreter ends
             sys.stdout.flush()
     except GreyboxError as error:
-        told = str(error).replace("--vessel V ", f"--vessel {shlex.quote(vessel)} ")
+        told = str(error)
+        if "--vessel V " in told:
+            told = told.replace("--vessel V ", f"--vessel {_vessel(options)} ")
         complain(f"{name}: {told}")
         return 1
     except BrokenPipeError:
@@ -168,6 +170,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         complain("greybox: stopped")
         return 130
     return 0
+
+
+def _vessel(options: argparse.Namespace) -> str:
+    """Return the vessel file that a command names, or that its model was estimated with."""
+    from greybox.model.model import load_model
+    from greybox.report.next_steps import typed
+
+    if given := getattr(options, "vessel", None):
+        return shlex.quote(given)
+    for model in (getattr(options, "model", None), *getattr(options, "models", ())):
+        if model:
+            return typed(load_model(model).record.get("provenance", {}), "vessel", "V")
+    return "V"
 
 
 def _run(options: argparse.Namespace) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
 from typing import Any, NoReturn
@@ -48,6 +49,8 @@ class Parser(argparse.ArgumentParser):
 
     # the place in a configuration file that the words come from, where they are not typed
     place = ""
+    # makes the parser of all commands, whose options may be typed at the wrong one
+    whole: Callable[[], Parser] | None = None
 
     def __init__(self, *given: Any, **named: Any) -> None:
         usual = {"formatter_class": partial(Formatter, max_help_position=26)}
@@ -86,13 +89,26 @@ class Parser(argparse.ArgumentParser):
         known = f" ({', '.join(map(str, action.choices))})" if action.choices else ""
         return f"{name} is missing{': ' * bool(told)}{told}{known}"
 
+    def _in_its_place(self, option: str) -> str:
+        """Return how what an unknown option names is given."""
+        name = option.lstrip("-").rstrip("s")
+        bare = {a.dest.rstrip("s") for a in self._actions if not a.option_strings}
+        if name in bare and self.usage:
+            return f": type '{self.usage}'"
+        if name == "vessel" and "model" in bare:
+            return ", as MODEL holds its vessel: leave it out"
+        of = sub_parsers(self.whole()).items() if self.whole else ()
+        others = [f"'greybox {n}'" for n, p in of if option in p._option_string_actions]
+        if 0 < len(others) < 3:
+            return f", which belongs to {' and '.join(others)}"
+        return f".{suggestion(option, self._option_string_actions)}"
+
     def error(self, message: str) -> NoReturn:
         """Exit with status 2 and one sentence, or raise one about the configuration file."""
         for pattern, sentence in _SENTENCES.items():
             message = re.sub(pattern, sentence, message)
         if found := re.match("unrecognized arguments: ([^ =]*)", message):
-            near = suggestion(found[1], self._option_string_actions)
-            message = f"there is no option '{found[1]}'.{near}"
+            message = f"there is no option '{found[1]}'{self._in_its_place(found[1])}"
         if found := re.match("the following arguments are required: (.*)", message):
             message = "; ".join(self._wanted(name) for name in found[1].split(", "))
         message += "." * (not message.endswith((".", "?")))

@@ -57,11 +57,14 @@ def typed(record: Mapping[str, Any], option: str, stand_in: str) -> str:
 
 
 def after_import(out: str, vessel: str, lacking: Sequence[str] = ()) -> NextStep:
-    """Return what to do with the log, or the folder of logs, which lacks these commands."""
+    """Return what to do with the log, or the folder of logs, which lacks these columns."""
     if lacking:
+        why = {"psi": "sway and yaw need the heading"}.get(
+            lacking[0], "a model needs what moves the thrusters"
+        )
         return NextStep(
             f"Name the raw column of {' and that of '.join(lacking)}, with its unit, in the vessel "
-            f"file's [columns], and import again: a model needs what moves the thrusters"
+            f"file's [columns], and import again: {why}"
         )
     return NextStep(
         "See whether sensors and the vessel file are right",

@@ -52,6 +52,8 @@ class SignTest:
     @property
     def sentence(self) -> str:
         """The result in words."""
+        if not self.of:
+            return f"{self.model} fits {self.state} as well as {self.against} in every log."
         return (
             f"{self.model} fits {self.state} better than {self.against} in {self.wins} of "
             f"{self.of} (p = {self.p_value:.2g})."

@@ -61,6 +61,11 @@ def test_estimate_simulate_compare(tmp_path, capsys):
     compared = json.loads(result.read_text())
     assert [m["model"] for m in compared["models"]] == ["m", "ls"]
     assert set(compared["models"][0]["logs"][0]["fit"]) == {"u", "v", "r"}
+    assert "'m' was estimated on these logs: how it fits there" in capsys.readouterr().out
+    raw = tmp_path / "raw.csv"
+    raw.write_text("tvec,u\n0,1\n")
+    assert run("simulate", model, raw, "--out", out) == 1
+    assert "greybox import raw.csv --vessel thesis --out log.csv" in capsys.readouterr().err
     html = without_scripts(page.read_text())
     assert html.count("<svg") == 1
     assert "http://" not in html.replace("http://www.w3.org", "").replace(
@@ -128,6 +133,7 @@ def test_a_plan_of_commands_is_simulated_from_a_start(noisy_csv, tmp_path, capsy
         (["estimate", "{log}", "--vessel", "thesis", "--structure", "thesys"], "Did you mean"),
         (["estimate", "{log}", "--vessel", "thesis", "--sample-time", "1.5"], "whole multiple"),
         (["compare", "{log}", "--log", "{log}"], "is not a model file"),
+        (["compare", "m", "--log", "{log}", "--report", "x.pdf"], "a page is HTML: name a file"),
         (["diagnose", "{log}", "--vessel", "thesis", "--validate", "{log}"], "Name it once"),
         (["diagnose", "{log}", "{log}", "--vessel", "thesis"], "name each trial once"),
         (["reproduce", "chapter4", "--runs", "1"], "needs at least 2 runs"),

@@ -174,6 +174,9 @@ def test_a_thruster_column_that_is_misspelt_gets_its_name_and_comes_before_the_c
     assert "'aft', which no file has. Did you mean 'Azimuth PS [rad]'?\n" in out
     assert "next: name the raw column of aft, with its unit, in the vessel file's [columns]" in out
     assert "greybox check" not in out
+    raw.rename(columns={"psi": "Compass"}).to_csv(tmp_path / "raw.csv", index=False)
+    _, out, _ = run(capsys, *given)
+    assert "next: name the raw column of psi and that of aft, with its unit" in out
 
 
 def sparse(path):

@@ -148,6 +148,7 @@ def test_only_tables_are_kept_of_logs_that_are_not_drawn(thesis_model, noisy_log
 
 
 def test_sign_test_is_binomial():
+    assert sign_test("b", "a", "u", [1], [1]).sentence == "b fits u as well as a in every log."
     t = sign_test("b", "a", "u", [1, 2, 3, 4, 5], [2, 3, 4, 5, 5])
     assert (t.wins, t.of) == (4, 4)
     assert t.p_value == pytest.approx(2 / 16)
