@@ -329,7 +329,7 @@ def stop_throttle(kind: Kind, helm: Helm, asked: Conditions) -> float:
     if math.isinf(least):
         raise UsageError(
             f"the vessel file states no least speed of {names}, so full astern is unknown: add "
-            f"speed_limits, or give --astern in the unit of {names}."
+            f"speed_limits and estimate again, or give --astern in the unit of {names}."
         )
     if least >= 0:
         raise UsageError(

@@ -26,6 +26,17 @@ from greybox.trial.manoeuvres.finding import Manoeuvre
 from greybox.trial.wind import true_wind
 
 
+def instant_orders(kind: Kind, model: ManoeuvringModel, helm: Helm) -> list[str]:
+    """Return the commands whose orders act at once, as neither rate nor lag of them is known."""
+    moved = helm.steer if kind in ("turning", "zigzag") else helm.drive
+    names = [n for n, share in zip(helm.columns, moved, strict=True) if share != 0]
+    rates = dict(zip(helm.columns, (x.rate for x in helm.limits), strict=True))
+    late = model.vessel.actuation
+    slow = (late.rate_on, *model.vessel.lagged_commands)
+    forces = late.lag > 0 and late.lag_on == "force"
+    return [n for n in names if rates[n] is None and n not in slow and not forces]
+
+
 def run_notes(
     kind: Kind,
     task: Task,
@@ -66,22 +77,13 @@ def run_notes(
             f"{short} of {total} draws do not complete the manoeuvre within {longest:.3g} s; "
             f"intervals are of the draws that reach the quantity, {worst.reached} at least."
         )
-    if kind in ("turning", "zigzag"):
-        names = [n for n, s in zip(helm.columns, helm.steer, strict=True) if s != 0]
-    else:
-        names = [n for n, v in zip(helm.columns, helm.drive, strict=True) if v != 0]
-    rates = dict(zip(helm.columns, (x.rate for x in helm.limits), strict=True))
-    late = model.vessel.actuation
-    slow = (late.rate_on, *model.vessel.lagged_commands)
-    forces = late.lag > 0 and late.lag_on == "force"
-    instant = [n for n in names if rates[n] is None and n not in slow and not forces]
-    if instant:
+    if instant := instant_orders(kind, model, helm):
         moved = ((k, c) for t in model.vessel.thrusters for k, c, _, _ in t.movements)
         keys = dict.fromkeys(f"{kind}_rate" for kind, column in moved if column in instant)
         told.append(
             f"{', '.join(instant)} {'follow' if len(instant) > 1 else 'follows'} orders at once, "
-            f"because the vessel file states no {' or '.join(keys)}: state it, or a ship whose "
-            f"helm takes time is predicted to answer too early."
+            f"because the vessel file states no {' or '.join(keys)}: state it "
+            f"and estimate again, or a ship whose helm takes time is predicted to answer too early."
         )
     if isinstance(own, TurningCircle | ZigZag) and own.direction * task.sign < 0:
         told.append(

@@ -26,6 +26,7 @@ from greybox.prediction.measuring import measure, quantities
 from greybox.prediction.misfit import held_out_errors, misfit_of
 from greybox.prediction.monte_carlo import MonteCarloQuantity, over_draws
 from greybox.prediction.notes import (
+    instant_orders,
     model_notes,
     prediction_level,
     run_notes,
@@ -240,6 +241,7 @@ def predict_manoeuvre(
         elsewhere,
         trust_level(model),
         prediction_level(model),
+        tuple(instant_orders(manoeuvre, model, helm)),
     )
 
 

@@ -271,6 +271,8 @@ class ManoeuvrePrediction(DisplayMixin):
         Of the estimate's verdict on its coefficients.
     prediction : PredictionLevel
         Of its verdict on its predictions.
+    instant : tuple of str
+        Commands whose orders are taken to act at once, as the vessel file has no rate of them.
     """
 
     kind: Kind
@@ -282,6 +284,7 @@ class ManoeuvrePrediction(DisplayMixin):
     conditions: tuple[ConditionDifference, ...] = ()
     trust: TrustLevel = TrustLevel.NOT_JUDGED
     prediction: PredictionLevel = PredictionLevel.NOT_JUDGED
+    instant: tuple[str, ...] = ()
 
     def summary(self) -> str:
         """Return all manoeuvres as text."""

@@ -99,6 +99,8 @@ def headline(made: ManoeuvrePrediction) -> str:
         * (made.prediction is PredictionLevel.NOT_JUDGED and made.trust is TrustLevel.DO_NOT_TRUST),
         *["the model is used beyond the motion that it was estimated on"]
         * any(m.extrapolated for m in made.manoeuvres),
+        *["orders are taken to act at once"]
+        * bool(made.instant and made.kind in ("turning", "zigzag")),
     ]
     return f"{told} But {' and '.join(doubts)}." if doubts else told
 

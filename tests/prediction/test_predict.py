@@ -138,6 +138,7 @@ def test_orders_are_not_said_to_act_at_once_where_the_model_delays_them(actuatio
         "delta follows orders at once, because the vessel file states no rudder_rate"
         in made.summary()
     ) == instant
+    assert ("orders are taken to act at once" in headline(made)) == instant
 
 
 @pytest.mark.parametrize("kind", ["turning", "zigzag", "crash"])
