@@ -12,7 +12,7 @@ from greybox.diagnosis.evidence.held_out import HeldOut, Pair, proof_of
 from greybox.diagnosis.evidence.omnibus import Omnibus, disagreement, omnibus
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain, file_word
-from greybox.diagnosis.search import Candidate, Search
+from greybox.diagnosis.search import Candidate, Search, left_to_motion
 from greybox.diagnosis.ship import LogRun
 from greybox.diagnosis.symptoms import coloured, word
 from greybox.diagnosis.thresholds import (
@@ -138,7 +138,12 @@ def rule(
 
 
 def leaves_more(found: Search, held_out: Callable[[Integrator], HeldOut]) -> bool:
-    """Whether what was found leaves more than noise."""
+    """Whether what was found leaves more than noise, or than a model of other terms would.
+
+    Where causes explain much, what is small beside them may still be large for a model.
+    """
+    if left_to_motion(held_out, found.final):
+        return True
     pairs = held_out(found.final.integrator).pairs(found.final)
     explained = _explained(found, held_out) if found.causes else 0.0
     left = omnibus(pairs)

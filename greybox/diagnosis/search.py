@@ -36,6 +36,7 @@ from greybox.diagnosis.refitting import (
 from greybox.diagnosis.result import Quantity
 from greybox.diagnosis.scores import MOMENTS, Score
 from greybox.diagnosis.thresholds import (
+    AS_CHOSEN,
     BACKWARDS,
     MOST_CAUSES,
     RELEVANT,
@@ -116,7 +117,7 @@ class Candidate:
     @property
     def holds(self) -> bool:
         """Whether the cause matters, is significant, and predicts."""
-        return self.counts and self.proof.p_value < level_of(self.fit)
+        return self.counts and self.proof.p_value < AS_CHOSEN
 
     @property
     def counts(self) -> bool:
@@ -253,9 +254,9 @@ def search(
         _told(steps, progress)
         if step.taken is None:
             break
-        left = not alone and _left_to_motion(case, fit)
+        left = not alone and left_to_motion(case.held_out, fit)
         fit, causes = _with(case, causes, step.taken, tried)
-        if left and _left_to_motion(case, fit):
+        if left and left_to_motion(case.held_out, fit):
             unexplained(fit)
             more = _completed(case, fit, causes, hypotheses) if len(causes) < most else None
             if more is not None:
@@ -304,17 +305,17 @@ def _completed(
     present = [h for h in hypotheses if not h.past]
     second = take_step(
         case, fit, causes, present, tried - len(present),
-        enough=lambda found: not _left_to_motion(case, found),
+        enough=lambda found: not left_to_motion(case.held_out, found),
     )  # fmt: skip
     if second.taken is None:
         return None
     fit, found = _with(case, causes, second.taken, tried)
-    return None if _left_to_motion(case, fit) else (second, fit, found)
+    return None if left_to_motion(case.held_out, fit) else (second, fit, found)
 
 
-def _left_to_motion(case: DiagnosisProblem, fit: Fit) -> bool:
+def left_to_motion(held_out: Callable[[Integrator], HeldOut], fit: Fit) -> bool:
     """Whether a force of motion and commands would explain more than a deviation to be told."""
-    pairs = case.held_out(fit.integrator).pairs(fit)
+    pairs = held_out(fit.integrator).pairs(fit)
     numbers = sum(int(pair.held.counts.sum()) for pair in pairs)
     left = omnibus(pairs, MOTION_AND_COMMANDS)
     return left.proof.p_value < SURE and left.gain > WORTH * numbers

@@ -1,4 +1,4 @@
-"""Spread and noise by medians, which few outliers do not move."""
+"""Spread: of noise by medians, which few outliers do not move, and of what differs by log."""
 
 from __future__ import annotations
 
@@ -51,3 +51,24 @@ def white_noise(parts: Sequence[Array]) -> float | None:
     rough = [np.diff(part, 3) for part in parts if len(part) > 3]
     known = np.concatenate([d[np.isfinite(d)] for d in rough]) if rough else np.zeros(0)
     return robust_deviation(known) / float(np.sqrt(_THIRD)) if len(known) else None
+
+
+def variance_between(apart: Array, weights: Array) -> Array:
+    """Return the variance between logs beyond that of chance (DerSimonian and Laird, 1986, eq. 8).
+
+    Parameters
+    ----------
+    apart : ndarray
+        (n, ...) values of the logs from their weighted mean.
+    weights : ndarray
+        (n, ...) one over the variance by chance of each, 0 where nothing is known of it.
+
+    Returns
+    -------
+    ndarray
+        (...) 0 where chance alone makes values differ as much.
+    """
+    total = weights.sum(axis=0)
+    spare = total - (weights**2).sum(axis=0) / np.maximum(total, 1e-300)
+    excess = (weights * apart**2).sum(axis=0) - ((weights > 0).sum(axis=0) - 1)
+    return np.asarray(np.maximum(excess, 0.0) / np.maximum(spare, 1e-300))

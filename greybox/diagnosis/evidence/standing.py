@@ -30,6 +30,7 @@ from greybox.diagnosis.thresholds import (
     SIGNIFICANT,
 )
 from greybox.model.terms import mirror_sign, parse_term
+from greybox.numerics.robust import variance_between
 
 Array = NDArray[np.float64]
 
@@ -173,9 +174,10 @@ def _moved(
 def _scatter(pair: Pair, hypothesis: Hypothesis) -> Array:
     """Return the variance of a hypothesis's numbers by what differs from log to log.
 
-    Its numbers alone are fitted to each log, the rest of the model as it is. What their variance
-    exceeds that of chance by is shared by the logs that the model was fitted to; of few logs it is
-    hardly known, as the variance of Student's t tells.
+    Its numbers alone are fitted to each log, the rest of the model as it is, and count by what each
+    log tells of them. What their variance exceeds that of chance by (DerSimonian and Laird, 1986)
+    is shared by the logs that the model was fitted to; of few logs it is hardly known, as the
+    variance of Student's t tells.
     """
     point = pair.fit.point
     k = [h.key for h in point.hypotheses].index(hypothesis.key)
@@ -188,8 +190,8 @@ def _scatter(pair: Pair, hypothesis: Hypothesis) -> Array:
     for problem, fit in ((pair.problem, pair.fit), (pair.held, pair.held_fit)):
         for run, start in zip(problem.runs, fit.point.starts, strict=True):
             one = Problem([run], problem.metric)
-            alone = Point(base, (start,), places, (hypothesis,), (point.values[k],))
-            found = one.fit(alone, fit.noise, most=_FEW)
+            its = Point(base, (start,), places, (hypothesis,), (point.values[k],))
+            found = one.fit(its, fit.noise, most=_FEW)
             if not found.escaped:
                 value, own = one.covariance(found)
                 numbers.append(value)
@@ -197,11 +199,14 @@ def _scatter(pair: Pair, hypothesis: Hypothesis) -> Array:
     count = len(pair.problem.numbers_of(point, hypothesis))
     if len(numbers) < 2 or not np.isfinite(chance).all():
         return np.zeros(count)
-    excess = np.var(numbers, axis=0, ddof=1) - np.mean(chance, axis=0)
+    values, by_chance = np.array(numbers), np.array(chance)
+    weights = np.divide(1.0, by_chance, out=np.zeros_like(by_chance), where=by_chance > 0)
+    mean = (weights * values).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-300)
+    excess = variance_between(values - mean, weights)
     wider = (len(numbers) - 1) / max(len(numbers) - 3, 1)
     reached = np.array([p.reach for p in hypothesis.parameters][:count])
     reached = np.pad(reached, (0, count - len(reached)))
-    shared = np.maximum(excess, 0.0) * wider / len(pair.problem.runs)
+    shared = excess * wider / len(pair.problem.runs)
     return np.where(reached > 0, 0.0, shared)
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.robust import variance_between
 from greybox.trial.checks.sensor_offsets.evidence import Evidence
 from greybox.trial.checks.sensor_offsets.model import ARM, BIAS, CAMPAIGN, CLOCKS, SIGMAS, SIZE
 from greybox.trial.raw_log import Array, Mask
@@ -192,15 +193,8 @@ def _scatter(logs: Sequence[Evidence], offsets: Sequence[Array]) -> Array:
     for k in range(SIZE):
         apart, weight = _deviations(logs, offsets, np.eye(SIZE)[k])
         told = weight > 0
-        count = int(told.sum())
-        if count < 3:
-            continue
-        w = weight[told]
-        q = float(w @ apart[told] ** 2)
-        spare = float(w.sum() - w @ w / w.sum())
-        excess = q - (count - 1)
-        if excess > 0 and spare > 0:
-            out[k] = np.sqrt(excess / spare)
+        if told.sum() >= 3:
+            out[k] = np.sqrt(variance_between(apart[told], weight[told]))
     return out
 
 
