@@ -367,7 +367,8 @@ class Diagnosis(DisplayMixin):
                 "Nothing is wrong that repeats: the errors of the free run do not recur in the "
                 "held-out logs."
             )
-        return f"{_SAID[self.verdict][0].upper()}{_SAID[self.verdict][1:]}."
+        said = f"{_SAID[self.verdict][0].upper()}{_SAID[self.verdict][1:]}."
+        return f"{said} {self.remaining}" if self.verdict == DiagnosisVerdict.UNEXPLAINED else said
 
     def to_dict(self) -> dict[str, Any]:
         """Return the diagnosis as the documented JSON, and further entries."""
@@ -397,7 +398,10 @@ class Diagnosis(DisplayMixin):
         """Return the diagnosis as text."""
         where = "What the simulation gets wrong (estimation logs):"
         lines = [f"verdict: {self.verdict}", self.headline, "", where]
-        lines += [f"  {s.sentence}" for s in self.wrong] or ["  nothing beyond noise"]
+        if not self.wrong:
+            good = self.verdict == DiagnosisVerdict.NONE
+            lines.append(f"  nothing beyond noise{'' if good else ' in these logs by themselves'}")
+        lines += [f"  {s.sentence}" for s in self.wrong]
         lines += [f"  {t.sentence}" for t in self.residuals.get("before", ()) if not t.passed]
         for title, causes in (
             ("Causes (± one standard error)", self.causes),
