@@ -8,7 +8,7 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -181,7 +181,9 @@ def _vessel(options: argparse.Namespace) -> str:
         return shlex.quote(given)
     for model in (getattr(options, "model", None), *getattr(options, "models", ())):
         if model:
-            return typed(load_model(model).record.get("provenance", {}), "vessel", "V")
+            # this is told of another error, and must raise none
+            with suppress(GreyboxError):
+                return typed(load_model(model).record.get("provenance", {}), "vessel", "V")
     return "V"
 
 
