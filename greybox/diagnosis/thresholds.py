@@ -11,10 +11,12 @@ from __future__ import annotations
 # significance of a cause after correction for all that were tried (Holm): blind, 5 % false alarms
 # of the whole search
 SIGNIFICANT = 0.01
-# significance of what it does for held-out logs, and of what it does beside a generic force
+# significance of what it does beside a generic force
 PROVEN = 0.05
-# the same where errors are weighed by their size alone: one standard error, as terms are chosen,
-# since few samples of errors with a long memory are independent. Foreign ships, real tanker
+# significance of what it does for held-out logs, and beside a generic force where errors are
+# weighed by their size alone: one standard error, as terms are chosen, since few samples of errors
+# with a long memory are independent. Foreign ships, real tanker: a lag of 28 % of the error had
+# p = 0.08; blind, 30 of 30 without an effect stayed without a cause
 AS_CHOSEN = 0.16
 # fall of −2 log L a measured number from which on a cause matters: blind, |r|r for r³ gained 0.1 %
 RELEVANT = 0.005
