@@ -174,10 +174,11 @@ def _moved(
 def _scatter(pair: Pair, hypothesis: Hypothesis) -> Array:
     """Return the variance of a hypothesis's numbers by what differs from log to log.
 
-    Its numbers alone are fitted to each log, the rest of the model as it is, and count by what each
-    log tells of them. What their variance exceeds that of chance by (DerSimonian and Laird, 1986)
-    is shared by the logs that the model was fitted to; of few logs it is hardly known, as the
-    variance of Student's t tells.
+    Its numbers alone are fitted to each log, the rest of the model as it is. What their variance
+    exceeds that of chance by is shared by the logs that the model was fitted to; of few logs it is
+    hardly known, as the variance of Student's t tells. An actuator is the same in all logs and
+    shows in few: what is late counts by what each log tells of it (DerSimonian and Laird, 1986).
+    Where a current or a wind is wrong, the log that tells most of it is wrong, too.
     """
     point = pair.fit.point
     k = [h.key for h in point.hypotheses].index(hypothesis.key)
@@ -200,9 +201,11 @@ def _scatter(pair: Pair, hypothesis: Hypothesis) -> Array:
     if len(numbers) < 2 or not np.isfinite(chance).all():
         return np.zeros(count)
     values, by_chance = np.array(numbers), np.array(chance)
-    weights = np.divide(1.0, by_chance, out=np.zeros_like(by_chance), where=by_chance > 0)
-    mean = (weights * values).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-300)
-    excess = variance_between(values - mean, weights)
+    excess = np.maximum(np.var(values, axis=0, ddof=1) - by_chance.mean(axis=0), 0.0)
+    if hypothesis.past:
+        weights = np.divide(1.0, by_chance, out=np.zeros_like(by_chance), where=by_chance > 0)
+        mean = (weights * values).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-300)
+        excess = variance_between(values - mean, weights)
     wider = (len(numbers) - 1) / max(len(numbers) - 3, 1)
     reached = np.array([p.reach for p in hypothesis.parameters][:count])
     reached = np.pad(reached, (0, count - len(reached)))
