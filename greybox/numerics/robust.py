@@ -54,7 +54,7 @@ def white_noise(parts: Sequence[Array]) -> float | None:
 
 
 def variance_between(apart: Array, weights: Array) -> Array:
-    """Return the variance between logs beyond that of chance (DerSimonian and Laird, 1986, eq. 8).
+    """Return the variance between logs beyond that of chance (DerSimonian and Laird, 1986).
 
     Parameters
     ----------
