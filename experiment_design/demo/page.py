@@ -8,6 +8,7 @@ from typing import Any
 from experiment_design.demo.steps import Demo, Step
 from experiment_design.output.report import design_page
 from experiment_design.output.result import Design
+from greybox.diagnosis.causes import known_causes
 from greybox.diagnosis.result import Diagnosis
 from greybox.model.model import ManoeuvringModel
 from greybox.report.chart import chart_of
@@ -94,13 +95,14 @@ def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
 
 def headline(diagnosis: Diagnosis, demo: Demo) -> str:
     """Return the story in a sentence."""
-    ids = [c.id for c in diagnosis.causes]
-    hidden = [e.id for e in demo.hidden]
+    known = known_causes()
+    named = [c.title for c in diagnosis.causes]
+    hidden = [known[e.id].title for e in demo.hidden]
     asked = f"A ship sailed with a hidden effect that its model lacked, {' and '.join(hidden)}"
-    if ids == hidden:
+    if named == hidden:
         return f"{asked}: the trial was designed, the cause found and named, the model extended."
     return f"{asked}; the verdict of these logs is '{diagnosis.verdict}'" + (
-        f", with {', '.join(ids)} named." if ids else "."
+        f", with {', '.join(named)} named." if named else "."
     )
 
 

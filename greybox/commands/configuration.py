@@ -72,10 +72,9 @@ def configure(
             others = sub_parsers(everything()).values() if table == EVERYWHERE else ()
             names = {*known, *(k for p in others for k in configurable(p))}
             if key not in names:
-                near = suggestion(key, sorted(names))
                 raise ConfigurationError(
-                    f"{parser.place}: there is no option '{key}'.{near} Correct the name, or "
-                    f"leave it out."
+                    f"{parser.place}: there is no option '{key}'.{suggestion(key, sorted(names))} "
+                    f"Correct the name, or leave it out."
                 )
     parser.place = f"'{name}'"
     parser.parse_args([w for some in words.values() for w in some])
@@ -95,8 +94,7 @@ def _read(path: Path) -> tuple[str, str, Mapping[str, Mapping[str, Any]]]:
         with open(path, "rb") as handle:
             data = handle.read(MOST_BYTES + 1)
         if len(data) > MOST_BYTES:
-            most = f"{MOST_BYTES} bytes, which no configuration needs: is it a log?"
-            raise ConfigurationError(f"'{name}' has more than {most}")
+            raise ConfigurationError(f"'{name}' has more than {MOST_BYTES} bytes: is it a log?")
         tables = tomllib.loads(data.decode("utf-8"))
     except OSError as error:
         raise ConfigurationError(f"cannot read '{name}': {error.strerror}.") from error

@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 from rich_argparse import RawDescriptionRichHelpFormatter, RichHelpFormatter
 
+from greybox.commands.common import OUTPUTS
 from greybox.commands.terminal import complain
 from greybox.errors import ConfigurationError, suggestion
 
@@ -64,10 +65,8 @@ class Parser(argparse.ArgumentParser):
         return " ".join([*words, "[OPTION ...]"]).replace("%", "%%")
 
     def for_parts(self) -> Parser:
-        """Return a copy that takes a part of a command line, and sets no more than it names.
-
-        Beside a mistyped option the right one would seem missing.
-        """
+        """Return a copy that takes a part of a command line, and sets no more than it names."""
+        # beside a mistyped option the right one would seem missing
         copy = deepcopy(self)
         for action in copy._actions:
             action.required = False
@@ -101,7 +100,10 @@ class Parser(argparse.ArgumentParser):
         others = [f"'greybox {n}'" for n, p in of if option in p._option_string_actions]
         if 0 < len(others) < 3:
             return f", which belongs to {' and '.join(others)}"
-        return f".{suggestion(option, self._option_string_actions)}"
+        own = [o for o in self._option_string_actions if o[2:] in OUTPUTS]
+        if own and name.startswith(OUTPUTS):
+            return f": {self.prog} writes with {', '.join(own)}"
+        return "." if others else f".{suggestion(option, self._option_string_actions)}"
 
     def error(self, message: str) -> NoReturn:
         """Exit with status 2 and one sentence, or raise one about the configuration file."""

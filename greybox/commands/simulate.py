@@ -49,6 +49,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.trial.checks.check import misnamed_columns
     from greybox.trial.convert.read import read_log
     from greybox.trial.gaps import split_at_gaps
+    from greybox.trial.log_files import find_logs
     from greybox.trial.segments import find_log_gaps
     from greybox.trial.validity import other_conditions
     from greybox.validation.bands import predict_bands
@@ -69,10 +70,16 @@ def run(options: argparse.Namespace) -> None:
                 f"1.5,1.2,0,0."
             )
         fill = dict(zip(("u", "v", "r", "psi"), values, strict=True))
-    log = read_log(options.log, model.vessel, states=model.structure.states, fill=fill, gaps=True)
+    path, *others = [file.path for file in find_logs([options.log])]
+    if others:
+        raise UsageError(
+            f"'{options.log}' holds {1 + len(others)} logs, and one run is of 1: name it, such as "
+            f"'{path}'."
+        )
+    log = read_log(path, model.vessel, states=model.structure.states, fill=fill, gaps=True)
     if fill and all(np.any(log[channel] != value) for channel, value in fill.items()):
         raise UsageError(
-            f"--start is '{options.start}', and '{options.log}' holds u, v, r and psi from which "
+            f"--start is '{options.start}', and '{path}' holds u, v, r and psi from which "
             f"its run starts: leave --start out, or name a log of commands only."
         )
     heading: Literal["measured", "simulated"] = options.heading or (
@@ -120,7 +127,7 @@ def run(options: argparse.Namespace) -> None:
         say(f"note: {', '.join(winds)} act as in still air, because the log has no wind")
     gaps = (g.sentence for g in find_log_gaps(result.log))
     others = (d.sentence for d in other_conditions(model.conditions, [log]))
-    for note in (*misnamed_columns([options.log], model.vessel), *gaps, *notes, *others):
+    for note in (*misnamed_columns([path], model.vessel), *gaps, *notes, *others):
         say(f"note: {note}")
     if not fill:
         began = "from the mean of the log's first 5 samples"

@@ -56,6 +56,18 @@ def test_a_broken_file_that_is_named_stops_the_command(folder, tmp_path, capsys)
     assert "broken.csv" in capsys.readouterr().err
 
 
+def test_a_run_is_of_one_log_of_a_folder(folder, tmp_path, capsys):
+    model, out, few = tmp_path / "m.json", tmp_path / "run.csv", tmp_path / "few"
+    main(["estimate", str(folder / "day0.csv"), *OPTIONS, "--out", str(model)])
+    few.mkdir()
+    for said in ("holds 0 files and 0 of them end in .csv", "holds 3 logs, and one run is of 1"):
+        typed = few if " 0 " in said else folder
+        assert main(["simulate", str(model), str(typed), "--out", str(out)]) == 1
+        assert said in capsys.readouterr().err
+    (few / "day0.csv").write_bytes((folder / "day0.csv").read_bytes())
+    assert main(["simulate", str(model), str(few), "--no-bands", "--out", str(out)]) == 0
+
+
 def test_a_folder_is_compared_and_checked_file_by_file(folder, tmp_path):
     model, out = tmp_path / "m.json", tmp_path / "c.json"
     main(["estimate", str(folder), *OPTIONS, "--out", str(model)])

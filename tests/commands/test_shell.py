@@ -126,6 +126,8 @@ def test_the_parser_imports_nothing_heavy():
         ("check a.csv --vessel s --fix", "'--fix', which belongs to 'greybox import'."),
         ("--verison", "greybox: there is no option '--verison'. Did you mean '--version'?"),
         ("simulate m.json --logs a.csv", "'--logs': type 'greybox simulate MODEL LOG --out CSV ["),
+        ("check a.csv --vessel s --out b", "'--out': greybox check writes with --json, --report."),
+        ("check a.csv --vessel s --cluster c", "there is no option '--cluster'. See"),
         ("compare m.json --vessel s", "'--vessel', as MODEL holds its vessel: leave it out."),
         ("estimate trial.csv --vessel s --method ivv", "Did you mean 'iv'? Known: ls, iv, oe."),
         ("estimate trial.csv --vessel s --mass heavy", "--mass: 'heavy' is no positive number."),

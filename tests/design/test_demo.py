@@ -4,12 +4,14 @@ import hashlib
 import json
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from browser import needs_browser, require_legible
 
 from experiment_design.demo.loop import EFFECTS, run_demo
+from experiment_design.demo.page import headline
 from greybox.commands.main import main
 from greybox.errors import UsageError
 from greybox.study.blind import sail
@@ -45,6 +47,18 @@ def test_unknown_effects_are_named_with_those_that_exist(tmp_path, capsys):
     assert "did you mean 'current'" in said.lower()
     assert not (tmp_path / "d").exists()
     assert "thruster_lag" in EFFECTS
+
+
+def test_its_headline_names_effects_by_their_titles():
+    lag = SimpleNamespace(id="thruster_lag", title="slow thrusters")
+    bias = SimpleNamespace(id="heading_bias", title="compass bias")
+    for causes, said in (
+        ([lag], "lacked, slow thrusters: the trial was designed, the cause found and named"),
+        ([bias], "lacked, slow thrusters; the verdict of these logs is 'named', with compass bias"),
+        ([], "lacked, slow thrusters; the verdict of these logs is 'named'."),
+    ):
+        diagnosis = SimpleNamespace(causes=causes, verdict="named")
+        assert said in headline(diagnosis, SimpleNamespace(hidden=[lag]))
 
 
 @pytest.fixture(scope="module")
