@@ -189,6 +189,20 @@ def after_prediction(
     model = typed(record, "model", "MODEL")
     agreements = [m.agreement for m in made.manoeuvres if m.agreement is not None]
     steps = []
+    if made.instant:
+        ship = made.manoeuvres[0].log.vessel
+        rates = dict.fromkeys(
+            f"{kind}_rate"
+            for t in ship.thrusters
+            for kind, column, _, _ in t.movements
+            if column in made.instant
+        )
+        steps.append(
+            NextStep(
+                f"State {' and '.join(rates)} in the vessel file, estimate again, and predict with "
+                f"that model: orders of {', '.join(made.instant)} act at once in this one"
+            )
+        )
     if any(c.verdict is Compliance.OPEN for m in made.manoeuvres for c in m.criteria):
         steps.append(
             NextStep(

@@ -18,6 +18,7 @@ from greybox.model.model import load_model
 from greybox.model.noise import NoiseLevels
 from greybox.prediction.measuring import quantities
 from greybox.prediction.predict import predict_manoeuvre
+from greybox.report.next_steps import after_prediction
 from greybox.report.prediction import headline
 from greybox.trial.log import make_log
 from greybox.trial.manoeuvres import Compliance, find_manoeuvres
@@ -139,6 +140,8 @@ def test_orders_are_not_said_to_act_at_once_where_the_model_delays_them(actuatio
         in made.summary()
     ) == instant
     assert ("orders are taken to act at once" in headline(made)) == instant
+    first = after_prediction(made, {}, "ship.toml")[0].line()
+    assert first.startswith("next: state rudder_rate in the vessel file, estimate ag") == instant
 
 
 @pytest.mark.parametrize("kind", ["turning", "zigzag", "crash"])
