@@ -106,6 +106,17 @@ def test_a_turn_is_sailed_in_the_wind_of_its_trial():
         rudder_model(step=STEP), "turning", trial=calm, draws=40).notes)  # fmt: skip
 
 
+@pytest.mark.parametrize(("then", "told"), [(12.0, False), (6.0, True)])
+def test_a_speed_loss_by_slower_propellers_is_said_to_be_no_loss_of_the_turn(then, told):
+    model = rudder_model(step=STEP)
+    log = trial(model, (25 * DEG,), (), lasts=220.0, then=then)
+    made = predict_manoeuvre(model, "turning", trial=log, draws=40)
+    assert (made.manoeuvres[0].quantities["speed_loss"].value > 0.3) == told
+    said = "the propellers run at 12 before the order and at 6 in the turn: the speed loss"
+    assert any(n.startswith(said) for n in made.notes) == told
+    assert any("speed loss" in n for n in made.notes) == told
+
+
 def in_current(log, north, east):
     """Return a log as it would be in water that flows [m/s]."""
     u, v = ned_to_body(north, east, log["psi"])
