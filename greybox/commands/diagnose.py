@@ -154,8 +154,7 @@ def run(options: argparse.Namespace) -> None:
     diagnosis = replace(
         diagnosis, next_steps=tuple(steps), notes=(*left_out, *also, *diagnosis.notes)
     )
-    if options.out:
-        _save(diagnosis, options.out, record)
+    written = _save(diagnosis, options.out, record) if options.out else []
 
     def page() -> Page:
         from greybox.report.diagnosis import diagnosis_page
@@ -164,7 +163,7 @@ def run(options: argparse.Namespace) -> None:
 
     told = diagnosis.to_dict() | told | {"provenance": record}
     # its summary tells them
-    publish(options, told, diagnosis.summary(), page, [], [options.out])
+    publish(options, told, diagnosis.summary(), page, [], written)
 
 
 def _with_files(steps: Sequence[str], record: Mapping[str, Any]) -> list[str]:
@@ -201,8 +200,14 @@ def _read(logs: list[TrialLog]) -> list[str]:
     return [f"{log.provenance.source or log.name} {log.provenance.sha256[:12]}" for log in logs]
 
 
-def _save(diagnosis: Diagnosis, path: str, record: dict[str, Any]) -> None:
-    """Write the extended model, and one for each of the causes that cannot be told apart."""
+def _save(diagnosis: Diagnosis, path: str, record: dict[str, Any]) -> list[str]:
+    """Write the extended model, and one for each of the causes that cannot be told apart.
+
+    Returns
+    -------
+    list of str
+        The files as the terminal tells them, the model last.
+    """
     from dataclasses import replace
     from pathlib import Path
 
@@ -210,8 +215,10 @@ def _save(diagnosis: Diagnosis, path: str, record: dict[str, Any]) -> None:
 
     target = Path(path)
     told = {"diagnosis": diagnosis.to_dict(), "provenance": record}
+    written = []
     for name, model in diagnosis.alternatives.items():
-        replace(model, record={**model.record, **told}).save(
-            target.with_name(f"{target.stem}.{file_word(name)}{target.suffix or '.json'}")
-        )
+        other = target.with_name(f"{target.stem}.{file_word(name)}{target.suffix or '.json'}")
+        replace(model, record={**model.record, **told}).save(other)
+        written.append(str(other))
     replace(diagnosis.model, record={**diagnosis.model.record, **told}).save(target)
+    return [*written, path if diagnosis.causes else f"{path}: no cause stands, so it holds none"]

@@ -49,33 +49,60 @@ void greybox_recursion(long long runs, long long steps, long long n, long long m
 """
 
 
-_FILTERED = """
+# rows that are filtered side by side: each waits for its own last sample only
+_ABREAST = 4
+_FILTERED = f"""
+void greybox_filtered(long long, long long, long long, const double*, const double*, double*,
+                      const double*, double*);
+
+static inline void abreast(const long long rows, long long samples, long long taps,
+                           const double* restrict b, const double* restrict a,
+                           double* restrict z, const double* restrict e, double* restrict y) {{
+  long long row, k, i;
+  for (i = 0; i < taps * rows; i++) z[i] = 0.0;
+  for (k = 0; k < samples; k++) {{
+    double x[{_ABREAST}], out[{_ABREAST}];
+    for (row = 0; row < rows; row++) {{
+      x[row] = e[row * samples + k];
+      out[row] = z[row] + b[0] * x[row];
+      y[row * samples + k] += out[row];
+    }}
+    for (i = 0; i + 1 < taps; i++)
+      for (row = 0; row < rows; row++)
+        z[i * rows + row] = z[(i + 1) * rows + row] + b[i + 1] * x[row] - a[i + 1] * out[row];
+  }}
+}}
+
 void greybox_filtered(long long rows, long long samples, long long taps, const double* restrict b,
                       const double* restrict a, double* restrict z, const double* restrict e,
-                      double* restrict y) {
-  long long row, k, i;
-  for (row = 0; row < rows; row++, e += samples, y += samples) {
-    for (i = 0; i < taps; i++) z[i] = 0.0;
-    for (k = 0; k < samples; k++) {
-      const double x = e[k], out = z[0] + b[0] * x;
-      for (i = 0; i + 1 < taps; i++) z[i] = z[i + 1] + b[i + 1] * x - a[i + 1] * out;
-      y[k] += out;
-    }
-  }
-}
+                      double* restrict y) {{
+  for (; rows >= {_ABREAST}; rows -= {_ABREAST}) {{
+    abreast({_ABREAST}, samples, taps, b, a, z, e, y);
+    e += {_ABREAST} * samples; y += {_ABREAST} * samples;
+  }}
+  for (; rows > 0; rows--, e += samples, y += samples) abreast(1, samples, taps, b, a, z, e, y);
+}}
 """
-_RECURSIVE = """
-void greybox_recursive(long long rows, long long samples, long long taps,
-                       const double* restrict a, double* restrict y) {
+_RECURSIVE = f"""
+void greybox_recursive(long long, long long, long long, const double*, double*);
+
+static inline void abreast(const long long rows, long long samples, long long taps,
+                           const double* restrict a, double* restrict y) {{
   long long row, k, d;
-  for (row = 0; row < rows; row++, y += samples) {
-    for (k = 1; k < samples; k++) {
-      double past = 0.0;
-      for (d = k < taps ? k : taps - 1; d > 0; d--) past -= a[d] * y[k - d];
-      y[k] += past;
-    }
-  }
-}
+  for (k = 1; k < samples; k++) {{
+    double past[{_ABREAST}] = {{0.0}};
+    for (d = k < taps ? k : taps - 1; d > 0; d--)
+      for (row = 0; row < rows; row++) past[row] -= a[d] * y[row * samples + k - d];
+    for (row = 0; row < rows; row++) y[row * samples + k] += past[row];
+  }}
+}}
+
+void greybox_recursive(long long rows, long long samples, long long taps,
+                       const double* restrict a, double* restrict y) {{
+  for (; rows >= {_ABREAST}; rows -= {_ABREAST}, y += {_ABREAST} * samples)
+    abreast({_ABREAST}, samples, taps, a, y);
+  for (; rows > 0; rows--, y += samples) abreast(1, samples, taps, a, y);
+}}
 """
 
 
@@ -195,7 +222,7 @@ def filtered(numerators: Array, denominator: Array, channels: Sequence[Array]) -
     out = np.zeros((len(numerators), *channels[0].shape))
     in_c = _compiled("greybox_filtered")
     # the state of a filter has a zero behind it
-    a, state = np.ascontiguousarray(denominator, float), np.zeros(len(denominator))
+    a, state = np.ascontiguousarray(denominator, float), np.zeros(_ABREAST * len(denominator))
     for i, j in zip(*np.nonzero(numerators.any(axis=2)), strict=True):
         b, y, e = numerators[i, j], out[i], np.ascontiguousarray(channels[j], float)
         if in_c is not None:

@@ -18,7 +18,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.numerics.recursion import decay
+from greybox.numerics.recursion import recursive
 from greybox.numerics.robust import robust_deviation
 from greybox.rotation import body_to_ned
 from greybox.trial.convert.derived_signals import continuous
@@ -210,27 +210,42 @@ def slope(value: Array, motion: Motion) -> Array:
     return np.concatenate([np.gradient(value[a:b], motion.step) for a, b in motion.stretches])
 
 
-def whiten(z: Array, gain: float, motion: Motion) -> Array:
-    """Return the innovations of the local-level model along axis 0, stretch by stretch."""
-    out = z.copy()
-    for a, b in motion.stretches:
-        out[a + 1 : b] -= z[a : b - 1]
-        out[a:b] = decay(1.0 - gain, out[a:b])
-    return out
+def whiten(z: Array, gain: float, motion: Motion, weight: Array | None = None) -> Array:
+    """Return innovations of the local-level model, less what each stretch's start explains.
 
+    A start is an unknown level; whitened it dies out by ``1 - gain`` a sample.
 
-def without_starts(white: Array, gain: float, motion: Motion, weight: Array | None = None) -> Array:
-    """Return whitened columns (N, …) less what the unknown start of each stretch explains.
+    Parameters
+    ----------
+    z : ndarray
+        (N, …) series along axis 0.
+    gain : float
+    motion : Motion
+    weight : ndarray, optional
+        (N,) of the innovations.
 
-    A start is a level; whitened it dies out by ``1 - gain`` a sample.
+    Returns
+    -------
+    ndarray
+        (N, …)
     """
-    out = white.copy()
+    white = _whitened(z.reshape(len(z), -1).T, gain, motion, weight)
+    return np.moveaxis(white.reshape(*z.shape[1:], len(z)), -1, 0)
+
+
+def _whitened(rows: Array, gain: float, motion: Motion, weight: Array | None = None) -> Array:
+    """Return what `whiten` does, of series (m, N) with time last."""
+    out = np.empty(rows.shape)
     for a, b in motion.stretches:
+        part = out[:, a:b]
+        part[:] = rows[:, a:b]
+        part[:, 1:] -= rows[:, a : b - 1]
+        part[:] = recursive(np.array([1.0, gain - 1.0]), part)
         died = (1.0 - gain) ** np.arange(b - a)
         if weight is not None:
-            died = died * weight[a:b]
-        share = np.tensordot(died, out[a:b], axes=(0, 0)) / float(died @ died)
-        out[a:b] -= died.reshape(-1, *[1] * (out.ndim - 1)) * share
+            part *= weight[a:b]
+            died *= weight[a:b]
+        part -= np.outer(part @ died / (died @ died), died)
     return out
 
 
@@ -268,13 +283,13 @@ def profile(z: Array, nuisance: Array, motion: Motion, gains: Array = GAINS) -> 
 def profiles(z: Array, nuisance: Array, motion: Motion, gains: Array = GAINS) -> list[Profile]:
     """Return the likelihood of each of several residuals (N, k, m); see `profile`."""
     size, (count, components) = len(z), z.shape[1:]
-    both = np.column_stack([z.reshape(size, -1), nuisance])
+    both = np.ascontiguousarray(np.column_stack([z.reshape(size, -1), nuisance]).T)
     logliks, stds = np.empty((len(gains), count)), np.empty((len(gains), count))
     for i, gain in enumerate(gains):
-        white = without_starts(whiten(both, float(gain), motion), float(gain), motion)
-        e, x = white[:, : count * components], white[:, count * components :]
-        rest = e - x @ solve(x, e)
-        variance = np.einsum("ij,ij->j", rest, rest).reshape(count, components).mean(axis=1) / size
+        white = _whitened(both, float(gain), motion)
+        e, x = white[: count * components], white[count * components :]
+        rest = e - solve(x.T, e.T).T @ x
+        variance = np.einsum("ij,ij->i", rest, rest).reshape(count, components).mean(axis=1) / size
         logliks[i] = -0.5 * size * components * np.log(np.maximum(variance, 1e-300))
         stds[i] = np.sqrt(variance)
     best = logliks.argmax(axis=0)

@@ -29,7 +29,6 @@ from greybox.trial.checks.motion import (
     slope,
     solve,
     whiten,
-    without_starts,
 )
 from greybox.trial.convert.resample import clock as make_clock
 from greybox.trial.convert.resample import hold
@@ -328,7 +327,7 @@ class _Problem:
         alone = self.without[state]
         joint = np.column_stack([self.columns, pushed])
         both = np.column_stack([joint, self.motion[state]])
-        white = without_starts(whiten(both, alone.gain, self.motion), alone.gain, self.motion)
+        white = whiten(both, alone.gain, self.motion)
         # a negative gain is no gain: a thruster that pulls is the other reading
         if float(solve(white[:, :-1], white[:, -1])[-1]) <= 0:
             return 0.0

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from greybox.numerics.lagged_moments import bartlett, weighted_lags
-from greybox.trial.checks.motion import GAINS, outlier_weights, solve, whiten, without_starts
+from greybox.trial.checks.motion import GAINS, outlier_weights, solve, whiten
 from greybox.trial.checks.sensor_offsets.model import BIAS, CLOCKS, SIZE, KinematicModel, Residuals
 from greybox.trial.raw_log import Array
 
@@ -67,8 +67,8 @@ class Likelihood:
             Minus the log-likelihood of the residuals, constants left out.
         """
         self._blocks, level = [], 0.0
-        for z, x in self._parts(residuals):
-            own = np.concatenate([z[:, :, None], x[:, :, SIZE:]], axis=2)
+        for z, _, mine in self._parts(residuals):
+            own = np.concatenate([z[:, :, None], mine], axis=2)
             tried = (self._tried(own, float(gain)) for gain in GAINS)
             _, gain, weight = min(tried, key=lambda x: x[0])
             white = self._white(own, gain, 1.0, weight).reshape(-1, own.shape[2])
@@ -79,7 +79,7 @@ class Likelihood:
         return level
 
     def rows(self, residuals: Residuals, *, scaled: bool = True) -> tuple[Array, Array]:
-        """Return whitened residuals (N, c) and columns (N, c, `SIZE`), a log's own projected out.
+        """Return whitened residuals (N, c) and columns (N, c, …), a log's own projected out.
 
         Parameters
         ----------
@@ -90,48 +90,46 @@ class Likelihood:
         n = len(self.tie.motion)
         parts = self._parts(residuals)
         y, x, own, at = [], [], [], 0
-        for (z, columns), (gain, std, weight) in zip(parts, self._blocks, strict=True):
-            stack = np.concatenate([z[:, :, None], columns], axis=2)
+        for (z, columns, mine), (gain, std, weight) in zip(parts, self._blocks, strict=True):
+            stack = np.concatenate([z[:, :, None], columns, mine], axis=2)
             white = self._white(stack, gain, std, weight)
+            size, count = columns.shape[2], mine.shape[2]
             y.append(white[:, :, 0])
-            x.append(white[:, :, 1 : 1 + SIZE])
-            mine = np.zeros((n, z.shape[1], _OWN))
-            count = columns.shape[2] - SIZE
-            mine[:, :, at : at + count] = white[:, :, 1 + SIZE :]
-            own.append(mine)
+            x.append(white[:, :, 1 : 1 + size])
+            room = np.zeros((n, z.shape[1], _OWN))
+            room[:, :, at : at + count] = white[:, :, 1 + size :]
+            own.append(room)
             at += count
         wide = np.concatenate(own, axis=1).reshape(-1, _OWN)
         if not scaled and self.tie.positioned:
             wide = np.delete(wide, _SCALE, axis=1)
         all_y = np.concatenate(y, axis=1)
         both = np.concatenate([all_y[:, :, None], np.concatenate(x, axis=1)], axis=2)
-        flat = both.reshape(-1, 1 + SIZE)
+        flat = both.reshape(-1, both.shape[2])
         flat = flat - wide @ solve(wide, flat)
         out = flat.reshape(both.shape)
         return out[:, :, 0], out[:, :, 1:]
 
     def misfit(self, offsets: Array, *, scaled: bool = True) -> float:
         """Return half the sum of squared whitened residuals at some offsets."""
-        y, _ = self.rows(self.tie.residuals(offsets), scaled=scaled)
+        y, _ = self.rows(self.tie.residuals(offsets, derivatives=False), scaled=scaled)
         return 0.5 * float(np.sum(y**2))
 
-    def _parts(self, residuals: Residuals) -> list[tuple[Array, Array]]:
-        parts = []
+    def _parts(self, residuals: Residuals) -> list[tuple[Array, Array, Array]]:
+        """Return residuals (N, c), derivatives (N, c, …) and a log's own, of each tie."""
+        r, parts = residuals, []
         if self.tie.positioned:
-            parts.append((residuals.position, residuals.position_columns))
+            parts.append((r.position, r.position_columns, r.position_own))
         if self.tie.turned:
-            parts.append((residuals.heading[:, None], residuals.heading_columns[:, None, :]))
+            parts.append((r.heading[:, None], r.heading_columns[:, None], r.heading_own[:, None]))
         return parts
 
     def _white(self, stack: Array, gain: float, std: float, weight: Array) -> Array:
-        motion = self.tie.motion
-        white = whiten(stack, gain, motion) * (weight / std)[:, None, None]
-        return without_starts(white, gain, motion, weight)
+        return whiten(stack, gain, self.tie.motion, weight / std)
 
     def _tried(self, own: Array, gain: float) -> tuple[float, float, Array]:
         """Return minus the log-likelihood with this gain, the gain, and weights of innovations."""
-        motion = self.tie.motion
-        white = without_starts(whiten(own, gain, motion), gain, motion)
+        white = whiten(own, gain, self.tie.motion)
         flat = white.reshape(-1, own.shape[2])
         rest = flat[:, 0] - flat[:, 1:] @ solve(flat[:, 1:], flat[:, 0])
         each = rest.reshape(own.shape[:2])
@@ -204,7 +202,7 @@ def search(tie: KinematicModel, coarse: KinematicModel, prior: Array) -> Array:
             break
         found = fit(rough, place, prior)
         coarse.align(best)
-        rough.adapt(coarse.residuals(best))
+        rough.adapt(coarse.residuals(best, derivatives=False))
         if rough.misfit(found) > rough.misfit(best) - _LEAST_GAIN:
             break
         best = found
@@ -217,7 +215,7 @@ def _best_place(likelihood: Likelihood, offsets: Array) -> tuple[float, Array]:
     """Return the place of a scan around some offsets that fits best, and what it gains."""
     tie = likelihood.tie
     tie.align(offsets)
-    likelihood.adapt(tie.residuals(offsets))
+    likelihood.adapt(tie.residuals(offsets, derivatives=False))
     # half a turn and a negative scale are the same
     tried = [
         (likelihood.misfit(p, scaled=scaled), p, scaled) for p, scaled in _places(tie, offsets)
@@ -229,7 +227,8 @@ def _best_place(likelihood: Likelihood, offsets: Array) -> tuple[float, Array]:
 def level(likelihood: Likelihood, offsets: Array, prior: Array) -> float:
     """Return minus the log-likelihood at some offsets, with what is expected of them."""
     likelihood.tie.align(offsets)
-    return likelihood.adapt(likelihood.tie.residuals(offsets)) + _unlikely(offsets, prior)
+    residuals = likelihood.tie.residuals(offsets, derivatives=False)
+    return likelihood.adapt(residuals) + _unlikely(offsets, prior)
 
 
 def _unlikely(offsets: Array, prior: Array) -> float:

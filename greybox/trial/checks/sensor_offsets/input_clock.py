@@ -20,7 +20,6 @@ from greybox.trial.checks.motion import (
     orderly,
     solve,
     whiten,
-    without_starts,
 )
 from greybox.trial.raw_log import Array, Recording
 from greybox.vessel.force import generalised_force
@@ -169,7 +168,7 @@ def _likelihoods(
     stack = np.column_stack([z, damping, *delayed])
     best: tuple[Array, float] | None = None
     for gain in GAINS[GAINS >= _LEAST_LEVEL]:
-        white = without_starts(whiten(stack, float(gain), motion), float(gain), motion)
+        white = whiten(stack, float(gain), motion)
         base = white[:, 1 : 1 + damping.shape[1]]
         rest = np.column_stack([white[:, 0], white[:, 1 + damping.shape[1] :]])
         rest = rest - base @ solve(base, rest)

@@ -52,6 +52,8 @@ _PRIOR = (2.0, 0.3, 0.15)
 class Residuals:
     """Residuals of one log at given offsets, and minus their derivatives.
 
+    Derivatives by the offsets have no columns where they were not asked for.
+
     Parameters
     ----------
     position : ndarray
@@ -59,15 +61,19 @@ class Residuals:
     heading : ndarray
         (N,) measured heading minus integrated yaw rate [rad].
     position_columns, heading_columns : ndarray
-        (N, 2, `SIZE` + 4) and (N, `SIZE` + 2): minus the derivatives by all offsets, then those by
-        what each log has of its own: a constant velocity of the water, a scale of the velocities
-        and a delay of east against north; or a bias and a scale of the yaw rate.
+        (N, 2, `SIZE`) and (N, `SIZE`): minus the derivatives by the offsets.
+    position_own, heading_own : ndarray
+        (N, 2, 4) and (N, 2): those by what each log has of its own: a constant velocity of the
+        water, a scale of the velocities and a delay of east against north; a bias and a scale of
+        the yaw rate.
     """
 
     position: Array
     heading: Array
     position_columns: Array
     heading_columns: Array
+    position_own: Array
+    heading_own: Array
 
 
 class KinematicModel:
@@ -102,50 +108,65 @@ class KinematicModel:
         self.smooth["psi"] = swept + smooth(self.motion["psi"] - swept, self.motion, seconds)
         self._channels.pop("psi", None)
 
-    def residuals(self, offsets: Array) -> Residuals:
-        """Return residuals and minus their derivatives at some offsets (`SIZE`,)."""
+    def residuals(self, offsets: Array, *, derivatives: bool = True) -> Residuals:
+        """Return residuals and minus their derivatives at some offsets (`SIZE`,).
+
+        Parameters
+        ----------
+        offsets : ndarray
+            (`SIZE`,)
+        derivatives : bool
+            Whether those by the offsets are wanted.
+        """
         m = self.motion
         n = len(m)
         late = self._late(offsets)
         slow = {k: self._channel(k).slow(late[k]) for k in CLOCKS if k in m}
         now = {k: slow[k] + self._channel(k).noise(late[k]) for k in slow}
-        rate = {k: slope(v, m) for k, v in slow.items()}
-        position, columns = np.zeros((n, 2)), np.zeros((n, 2, SIZE + 4))
+        rate = {k: slope(v, m) for k, v in slow.items()} if derivatives else {}
+        size = SIZE if derivatives else 0
+        position, columns, own = np.zeros((n, 2)), np.zeros((n, 2, size)), np.zeros((n, 2, 4))
         if self.positioned:
             bias, arm = offsets[BIAS], offsets[ARM]
             psi = slow["psi"] - bias
             lever = to_ned(psi, np.full(n, arm[0]), np.full(n, arm[1]))
-            walked = integrate(to_ned(now["psi"] - bias, now["u"], now["v"]), m)
-            position = np.column_stack([m["x_n"], m["y_n"]]) - walked - lever
-            ahead = to_ned(psi, rate["u"], np.zeros(n))
-            aside = to_ned(psi, np.zeros(n), rate["v"])
-            velocity = to_ned(psi, slow["u"], slow["v"])
-            across = np.column_stack([-velocity[:, 1], velocity[:, 0]])
             seconds = max(_NOISE_WINDOW, 5 * m.step)
             steady = to_ned(psi, smooth(slow["u"], m, seconds), smooth(slow["v"], m, seconds))
-            levered = np.column_stack([-lever[:, 1], lever[:, 0]])
-            turning = rate["psi"][:, None]
-            ways = integrate(np.hstack([ahead, aside, across * turning, across, steady]), m)
-            columns[:, :, CLOCKS.index("u")] = ways[:, 0:2]
-            columns[:, :, CLOCKS.index("v")] = ways[:, 2:4]
-            columns[:, :, CLOCKS.index("psi")] = ways[:, 4:6] + levered * turning
-            columns[:, :, ARM.start] = to_ned(psi, np.ones(n), np.zeros(n))
-            columns[:, :, ARM.start + 1] = to_ned(psi, np.zeros(n), np.ones(n))
-            columns[:, :, BIAS] = -ways[:, 6:8] - levered
-            columns[:, 0, SIZE] = columns[:, 1, SIZE + 1] = self.drift
-            columns[:, :, SIZE + 2] = ways[:, 8:10]
+            walked = to_ned(now["psi"] - bias, now["u"], now["v"])
+            velocity = to_ned(psi, slow["u"], slow["v"])
+            ways = [walked, steady]
+            if derivatives:
+                across = np.column_stack([-velocity[:, 1], velocity[:, 0]])
+                turning = rate["psi"][:, None]
+                ahead = to_ned(psi, rate["u"], np.zeros(n))
+                aside = to_ned(psi, np.zeros(n), rate["v"])
+                ways += [ahead, aside, across * turning, across]
+            ways = np.split(integrate(np.hstack(ways), m), len(ways), axis=1)
+            position = np.column_stack([m["x_n"], m["y_n"]]) - ways[0] - lever
+            if derivatives:
+                levered = np.column_stack([-lever[:, 1], lever[:, 0]])
+                columns[:, :, CLOCKS.index("u")] = ways[2]
+                columns[:, :, CLOCKS.index("v")] = ways[3]
+                columns[:, :, CLOCKS.index("psi")] = ways[4] + levered * turning
+                columns[:, :, ARM.start] = to_ned(psi, np.ones(n), np.zeros(n))
+                columns[:, :, ARM.start + 1] = to_ned(psi, np.zeros(n), np.ones(n))
+                columns[:, :, BIAS] = -ways[5] - levered
+            own[:, 0, 0] = own[:, 1, 1] = self.drift
+            own[:, :, 2] = ways[1]
             # one receiver has one clock, but axes that are not square, as of a local grid, look
             # like two in a turn: their mean is compared with the other clocks
-            columns[:, :, SIZE + 3] = velocity * np.array([-0.5, 0.5])
-        heading, swept = np.zeros(n), np.zeros((n, SIZE + 2))
+            own[:, :, 3] = velocity * np.array([-0.5, 0.5])
+        heading, swept, gyro = np.zeros(n), np.zeros((n, size)), np.zeros((n, 2))
         if self.turned:
-            both = integrate(np.column_stack([now["r"], slow["r"], rate["r"]]), m)
+            rates = [now["r"], slow["r"], *([rate["r"]] if derivatives else [])]
+            both = integrate(np.column_stack(rates), m)
             heading = now["psi"] - both[:, 0]
-            if self.positioned:
-                swept[:, CLOCKS.index("psi")] = -rate["psi"]
-            swept[:, CLOCKS.index("r")] = both[:, 2]
-            swept[:, SIZE], swept[:, SIZE + 1] = self.drift, both[:, 1]
-        return Residuals(position, heading, columns, swept)
+            if derivatives:
+                if self.positioned:
+                    swept[:, CLOCKS.index("psi")] = -rate["psi"]
+                swept[:, CLOCKS.index("r")] = both[:, 2]
+            gyro[:, 0], gyro[:, 1] = self.drift, both[:, 1]
+        return Residuals(position, heading, columns, swept, own, gyro)
 
     def _late(self, offsets: Array) -> dict[str, float]:
         late = {n: float(x) for n, x in zip(CLOCKS, offsets[: len(CLOCKS)], strict=True)}
