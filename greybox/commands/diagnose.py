@@ -221,4 +221,7 @@ def _save(diagnosis: Diagnosis, path: str, record: dict[str, Any]) -> list[str]:
         replace(model, record={**model.record, **told}).save(other)
         written.append(str(other))
     replace(diagnosis.model, record={**diagnosis.model.record, **told}).save(target)
-    return [*written, path if diagnosis.causes else f"{path}: no cause stands, so it holds none"]
+    return [
+        *written,
+        path if diagnosis.causes else f"{path}: the model without a cause, as none stands",
+    ]

@@ -192,6 +192,8 @@ def run(options: argparse.Namespace) -> None:
         write_json({"logs": records} if folder else records[0], options.json)
     if options.json != "-":
         say(summary)
+        if (options.fix or options.fix_also) and "\nmended: " not in summary:
+            say("mended: nothing, as the checks found nothing of what was to be mended")
         for key in pairs(options.note, "--note"):
             if key not in UNITS and (near := suggestion(key, UNITS)):
                 say(f"note: '{key}' is kept in words, as no condition.{near}")

@@ -295,10 +295,21 @@ def test_columns_in_another_unit_are_told_by_every_command_that_reads_logs(tmp_p
         ["estimate", *known[1], *LEAST, "--out", model],
         ["compare", model, *known[0], "--no-bands"],
         ["simulate", model, log, "--no-bands", "--out", tmp_path / "run.csv"],
-        ["diagnose", *known[1], "--model", model, "--causes", "current"],
+        [
+            "diagnose",
+            *known[1],
+            "--model",
+            model,
+            "--causes",
+            "current",
+            "--out",
+            tmp_path / "x.json",
+        ],
     ):
         assert run(*command) == 0
         said = " ".join(capsys.readouterr().out.split())
+        if command[0] == "diagnose":
+            assert said.endswith("x.json: the model without a cause, as none stands")
         for name, unit in (("psi", "deg"), ("alpha1", "deg"), ("u", "kn"), ("v", "kn")):
             mend = f'"{name}" = {{ name = "{name}", unit = "{unit}" }}'
             assert mend in said, (command[0], mend)

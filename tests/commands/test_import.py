@@ -141,6 +141,9 @@ def test_angles_that_cannot_be_radians_are_told(tmp_path, capsys):
     status, out, _ = run(capsys, *given, "--fix", "--fix-not", "stuck")
     assert "note: alpha1 reaches" not in out
     assert "mended: unit of alpha1" in out
+    again = ["import", tmp_path / "log.csv", "--vessel", "thesis", "--out", tmp_path / "again.csv"]
+    assert "mended" not in run(capsys, *again)[1]
+    assert "\nmended: nothing, as the checks" in run(capsys, *again, "--fix-also", "lever_arm")[1]
 
 
 def test_a_mapping_that_no_file_has_is_told(tmp_path, capsys):
