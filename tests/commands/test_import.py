@@ -143,7 +143,8 @@ def test_angles_that_cannot_be_radians_are_told(tmp_path, capsys):
     assert "mended: unit of alpha1" in out
     again = ["import", tmp_path / "log.csv", "--vessel", "thesis", "--out", tmp_path / "again.csv"]
     assert "mended" not in run(capsys, *again)[1]
-    assert "\nmended: nothing, as the checks" in run(capsys, *again, "--fix-also", "lever_arm")[1]
+    nothing = run(capsys, *again, "--fix", "--fix-not", "stuck")
+    assert "\nmended: nothing, as the checks" in nothing[1]
 
 
 def test_a_mapping_that_no_file_has_is_told(tmp_path, capsys):
