@@ -88,7 +88,8 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """Return the known name nearest to `name`, or ``""`` where none is near."""
     folded = {k.casefold(): k for k in known}
     near = get_close_matches(name.casefold(), list(folded), n=1, cutoff=0.6)
-    # a unit behind the name is the usual difference, as in 'psi [deg]'
-    longer = [k for k in folded if k.startswith((f"{name.casefold()} ", f"{name.casefold()}_"))]
+    # a unit behind the name is the usual difference, as in 'psi [deg]', or a word before it
+    own = name.casefold()
+    longer = [k for k in folded if k.startswith((f"{own} ", f"{own}_")) or k.endswith(f"_{own}")]
     found = near or longer[:1]
     return folded[found[0]] if found else ""

@@ -101,8 +101,8 @@ def run(options: argparse.Namespace) -> None:
     given = [n.replace("_", "-") for n in _OF_LOGS if getattr(options, n) is not None]
     if others and given:
         raise UsageError(
-            f"{', '.join(f'--{n}' for n in given)}: these belong to chapter7, not to "
-            f"{options.study}: leave them out."
+            f"{options.study} takes no {', '.join(f'--{n}' for n in given)}: logs and what is read "
+            f"with them belong to chapter7. Leave that out."
         )
     with _folder(options.out):
         _run(options)

@@ -165,6 +165,7 @@ def test_wrong_usage_is_one_sentence_with_the_nearest_name(capsys, line, message
         ("compare modle.json --log trial.csv", "Did you mean 'model.json'?"),
         ("estimate trial.csv --vessel ship.toml --structure thesys", "Did you mean 'thesis'?"),
         ("diagnose trial.csv --vessel ship.toml --causes curent", "Did you mean 'current'?"),
+        ("diagnose trial.csv --vessel ship.toml --causes lag", "Did you mean 'thruster_lag'?"),
         ("diagnose trial.csv --vessel ship.toml --causes wind,waves", "causes apart, with spaces"),
         (
             "estimate trial.csv --vessel ship.toml --structure thesis+N_|r|q",
