@@ -138,7 +138,7 @@ def test_a_plan_of_commands_is_simulated_from_a_start(noisy_csv, tmp_path, capsy
         (["diagnose", "{log}", "{log}", "--vessel", "thesis"], "name each trial once"),
         (["reproduce", "chapter4", "--runs", "1"], "needs at least 2 runs"),
         (["reproduce", "chapter4", "--estimate", "x"], "belong to chapter7"),
-        (["reproduce", "chapter6", "--sample-time", "2"], "--sample-time: these belong to chapter"),
+        (["reproduce", "chapter6", "--sample-time", "2"], "takes no --sample-time: logs and"),
         (["reproduce", "chapter4", "--out", "{log}"], "cannot make the folder"),
         (["reproduce", "power", "--runs", "0"], "each effect needs at least 1 trial"),
         (["reproduce", "chapter7", "--sample-time", "2"], "and none is named"),
