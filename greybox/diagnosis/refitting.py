@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain
+from operator import itemgetter
 from typing import TypeVar
 
 import numpy as np
@@ -15,7 +17,7 @@ from greybox.diagnosis.noise import SEEN
 from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.scores import ProjectedScores, Score, score_hypotheses
-from greybox.numerics.parallel import map_forked
+from greybox.numerics.parallel import lanes, map_forked
 
 Array = NDArray[np.float64]
 Told = TypeVar("Told")
@@ -119,22 +121,24 @@ def promises(
     a cause promises is hidden, and its search ends where it began. What promises most to errors
     that forget is to be judged with their likeliest colour.
     """
+    fits = [fit, problem.forgetful(fit, _FORGOTTEN)] if slow(fit) else [fit]
     keys = [h.key for h in hypotheses]
+    parts = max(1, lanes() // len(fits))
+    pieces = [(at, hypotheses[k::parts]) for at in fits for k in range(parts)]
 
-    def work(forgets: bool) -> tuple[Fit, list[tuple[int, Array, float]]]:
-        at = problem.forgetful(fit, _FORGOTTEN) if forgets else fit
-        told = score_hypotheses(ProjectedScores(problem, at), hypotheses)
+    def work(k: int) -> list[tuple[int, Array, float]]:
+        at, some = pieces[k]
+        told = score_hypotheses(ProjectedScores(problem, at), some)
         # hypotheses are functions, which no other process can send
-        numbers = [(keys.index(s.hypothesis.key), s.value, s.gain) for s in told]
-        return replace(at, point=replace(at.point, hypotheses=())), numbers
+        return [(keys.index(s.hypothesis.key), s.value, s.gain) for s in told]
 
+    done = map_forked(work, range(len(pieces)))
     found = []
-    for at, numbers in map_forked(work, [False, True] if slow(fit) else [False]):
-        scores = [
-            Score(hypotheses[i], value, gain)
-            for i, value, gain in sorted(numbers, key=lambda n: n[0])
-        ]
-        found.append((replace(at, point=fit.point), sorted(scores, key=lambda s: -s.gain)))
+    for n, at in enumerate(fits):
+        numbers = chain.from_iterable(done[n * parts : (n + 1) * parts])
+        told = sorted(numbers, key=itemgetter(0))
+        scores = [Score(hypotheses[i], value, gain) for i, value, gain in told]
+        found.append((at, sorted(scores, key=lambda s: -s.gain)))
     plain, *forgetful = found
     later = [(at, score) for at, scores in forgetful for score in shortlist(scores)[:_SECOND]]
     return plain[1], later

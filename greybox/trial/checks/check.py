@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from greybox.errors import LogError, UsageError
+from greybox.numerics.parallel import map_forked
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.checks.actuators import measure_actuators
 from greybox.trial.checks.course import course_findings, make_course
@@ -170,10 +171,8 @@ def check_recordings(
                 f"count as 2 logs: name one of them."
             )
         known[content] = name
-    logs = []
-    for recording in recordings:
-        _log.info("samples of %s", recording.name)
-        logs.append(_signal_quality(recording, vessel))
+    _log.info("samples of %d log(s)", len(recordings))
+    logs = map_forked(lambda recording: _signal_quality(recording, vessel), recordings)
     _log.info("axes, signs, units, clocks, antenna and heading of %d log(s) together", len(logs))
     _kinematics(logs, vessel)
     actuators: tuple[ActuatorEstimate, ...] = ()

@@ -8,13 +8,14 @@ heading to positions, the course over ground tells whether heading or yaw rate i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.numerics.parallel import map_forked
 from greybox.rotation import ned_to_body
 from greybox.trial.checks.course import PLAUSIBLE, Course, course_scatter
 from greybox.trial.checks.finding import Finding, Outcome, declare_unit, exact_finding
@@ -231,7 +232,8 @@ def find_readings(
         1e-7) and shrink the residual by 15 %. A log that contradicts the
         others by as much is read by itself.
     """
-    logs = [_Alternatives(m) for m in motions]
+    scores = map_forked(lambda m: _Alternatives(m).cache, motions)
+    logs = [_Alternatives(m, known) for m, known in zip(motions, scores, strict=True)]
     groups = read_together(dict(enumerate(logs)), _decide, _contradicts)
     readings: dict[int, ColumnReading] = {}
     for key, group in groups:
@@ -500,16 +502,18 @@ def _silent(changes: tuple[ColumnHypothesis, ...]) -> ColumnHypothesis:
 
 # what a reading is called, in every log: the words of its changes
 Key = tuple[str, ...]
+# a relation's name, and the reading that it is looked at by
+_Residual = tuple[str, Key]
 _LATER = ("turned", "late", "aside")
 
 
 class _Alternatives:
-    """Log-likelihoods of the readings of one log; what does not change between them is kept."""
+    """Log-likelihoods of the readings of one log; those that are known are not computed again."""
 
-    def __init__(self, motion: Motion) -> None:
+    def __init__(self, motion: Motion, known: Mapping[_Residual, float] | None = None) -> None:
         self.motion = motion = motion.coarser(_STEP).excerpt(_EXCERPT)
         self.relations = [r for r in _RELATIONS if all(n in motion for n in r.channels)]
-        self.cache: dict[tuple[str, Key], float] = {}
+        self.cache = dict(known or {})
         # neighbouring samples of a fast log say the same: its likelihood counts them all
         self.sample_correlation_factor = max(1.0, 0.5 / motion.step / 5)
         usable = [c for c in _CHANGES if self.applies(c)]
