@@ -270,7 +270,7 @@ def _section(
             sentences.append(f"{f.line}; drawn for {shown[f.key]}, where it was found, too.")
             continue
         svg = to_svg(figure, f"log{number}finding{k}")
-        pictures.append(Picture(svg, f"{said}{doubt}", f"{alternative(f)}{doubt}"))
+        pictures.append(Picture(svg, f"{said}{doubt}", f"{alternative(f)}{doubt}", broad=True))
     if report.recording is not None:
         try:
             log = _whole(report.recording, vessel)

@@ -23,14 +23,16 @@ if TYPE_CHECKING:
 class Picture:
     """An SVG with the text below it, and the one that stands for it (the caption by default).
 
-    Narrow ones stand beside one another where the window has room. One with a
-    chart can be zoomed on screen.
+    Narrow ones stand beside one another where the window has room. Broad ones, of several
+    columns, keep a legible size on a phone, where they scroll sideways. One with a chart
+    can be zoomed on screen.
     """
 
     svg: str
     caption: str
     alternative: str = ""
     narrow: bool = False
+    broad: bool = False
     chart: Chart | None = None
 
 
@@ -102,7 +104,8 @@ class Page:
 
 _NONE = "'none'"
 _TEMPLATE = """{% macro drawn(picture) %}{% set chart = chart_of(picture) %}
-<figure role="group" class="{{ 'narrow ' if picture.narrow }}{{ 'zoomable' if chart }}"
+<figure role="group" class="{{ 'narrow ' if picture.narrow }}
+{{- 'broad ' if picture.broad }}{{ 'zoomable' if chart }}"
  aria-label="{{ picture.alternative or picture.caption }}">
 {{ picture.svg | safe }}
 {% if chart %}
@@ -204,6 +207,8 @@ del { background: #f9ddcc; }
 @media screen { .open > svg { display: none; } .open > .zoom { display: block; }
   figure.narrow.open { grid-column: 1 / -1; } }
 @media screen and (max-width: 600px) {
+  figure.broad { overflow-x: auto; } figure.broad > svg { width: 44rem; max-width: none; }
+  figure.broad figcaption { position: sticky; left: 0; }
   table.sentences, table.sentences tbody, table.sentences caption { display: block;
     width: auto; }
   table.sentences thead { display: none; }

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import needs_browser, require_legible, without_scripts
+from browser import driven, needs_browser, require_legible, without_scripts
 from virtual import as_recording, recorded
 
 from greybox.commands.main import main
@@ -421,3 +421,9 @@ def test_in_a_browser(tmp_path, width):
     path = tmp_path / "page.html"
     check_page([row_case("gap")], [Path("a.csv")], SHIP, path)
     require_legible(path, width)
+    with driven(path) as browser:
+        size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        assert browser.execute_script(
+            "return document.querySelector('.broad > svg').getBoundingClientRect().width > 600"
+        )
