@@ -216,6 +216,23 @@ def require_ending(path: str | None, ending: str, what: str, option: str = "--ou
         )
 
 
+def require_log_ending(path: str) -> None:
+    """Raise where a log would be written under the ending of another format.
+
+    Raises
+    ------
+    UsageError
+        Commands that read files by their endings would take it for another.
+    """
+    from greybox.errors import UsageError
+    from greybox.trial.log_files import ENDINGS
+
+    if (ending := Path(path).suffix).lower() not in ("", *ENDINGS):
+        raise UsageError(
+            f"--out {path} ends in '{ending}': name a log that ends in .csv or .parquet."
+        )
+
+
 # options that name files to read, and to write
 _INPUTS = (
     "logs", "log", "models", "model", "nominal", "validate", "estimate", "vessel", "prior",

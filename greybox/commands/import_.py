@@ -5,7 +5,14 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from greybox.commands.common import VESSEL_HELP, positive, provenance, say, show_next
+from greybox.commands.common import (
+    VESSEL_HELP,
+    positive,
+    provenance,
+    require_log_ending,
+    say,
+    show_next,
+)
 
 if TYPE_CHECKING:
     from greybox.trial.convert.options import ImportOptions
@@ -145,7 +152,6 @@ def run(options: argparse.Namespace) -> None:
     from greybox.report.next_steps import after_import
     from greybox.trial.checks.check import require_each_once
     from greybox.trial.import_files import import_files, is_folder, raw_files, targets
-    from greybox.trial.log_files import ENDINGS
     from greybox.trial.readers.formats import has_topics
     from greybox.trial.store import read_record, record_path
     from greybox.vessel.conditions import UNITS
@@ -165,15 +171,11 @@ def run(options: argparse.Namespace) -> None:
             f"or an MCAP file: name the bag, or leave --topic out."
         )
     folder = is_folder(raw, options.out)
-    if not folder and Path(options.out).suffix.lower() not in ("", *ENDINGS):
-        raise UsageError(
-            f"--out {options.out} ends in '{Path(options.out).suffix}': name a log that ends in "
-            f".csv or .parquet."
-        )
     logs = targets(raw, options.out) if folder else [Path(options.out)]
     if folder:
         check_targets(options.json)
     else:
+        require_log_ending(options.out)
         check_targets(options.out, record_path(options.out), options.json)
     vessel = load_vessel(options.vessel)
     summary = import_files(

@@ -14,6 +14,7 @@ from greybox.commands.common import (
     provenance,
     publish,
     read_logs,
+    require_log_ending,
 )
 
 if TYPE_CHECKING:
@@ -142,6 +143,8 @@ def run(options: argparse.Namespace) -> None:
     from greybox.report.next_steps import after_prediction, typed
     from greybox.trial.manoeuvres import Compliance
 
+    if options.out:
+        require_log_ending(options.out)
     check_targets(options.json, options.report, options.out)
     angles = [_angle(text) for text in options.angle]
     command = _command(options.propellers)

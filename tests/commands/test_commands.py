@@ -386,6 +386,11 @@ def test_a_model_is_not_written_under_the_ending_of_a_log(command, tmp_path, cap
     assert not out.exists()
 
 
+def test_a_predicted_run_is_written_as_a_log_only(tmp_path, capsys):
+    assert run("predict", "m.json", "zigzag", "--out", tmp_path / "run.json") == 1
+    assert "ends in '.json': name a log that ends in .csv or .parquet" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("given", "what"),
     [(("simulate", "m.json", "trial.csv"), "a run"), (("fleet", "."), "the table")],
