@@ -20,6 +20,7 @@ from greybox.commands.common import (
     positive,
     progress,
     provenance,
+    require_ending,
     say,
     show_next,
 )
@@ -353,6 +354,8 @@ def run(options: argparse.Namespace) -> None:
 
         options.legs = str(legs_path(options.legs, options.out))
     legs = _legs_files(options)
+    require_ending(options.out, ".csv", "a plan")
+    require_ending(options.save_model, ".json", "a model", "--save-model")
     check_targets(
         options.out, options.json, options.sheet, options.report, *legs, options.save_model
     )

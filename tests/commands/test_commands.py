@@ -393,7 +393,11 @@ def test_a_predicted_run_is_written_as_a_log_only(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("given", "what"),
-    [(("simulate", "m.json", "trial.csv"), "a run"), (("fleet", "."), "the table")],
+    [
+        (("simulate", "m.json", "trial.csv"), "a run"),
+        (("fleet", "."), "the table"),
+        (("design", "--vessel", "thesis", "--model", "m.json", "--duration", "60"), "a plan"),
+    ],
 )
 def test_text_is_not_written_under_the_ending_of_another_format(given, what, tmp_path, capsys):
     out = tmp_path / "run.parquet"
