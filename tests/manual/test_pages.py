@@ -13,6 +13,7 @@ import pytest
 
 import greybox
 from greybox.commands.main import build_parser, main
+from greybox.diagnosis.result import DiagnosisVerdict
 from greybox.study.chapter6 import START
 from greybox.trial.checks.finding import IDS
 from greybox.trial.readers import formats
@@ -118,6 +119,21 @@ def test_dotted_names_exist(page):
                 value = import_module(".".join(whole[:k]))
             else:
                 value = getattr(value, part)
+
+
+def test_words_of_the_commands_are_explained():
+    words = {w for line in re.findall(r"^(\w[^\n]*)\n  \S", text_of("glossary.md"), re.M)
+             for w in line.split(", ")}  # fmt: skip
+    asked = ("regime", "margin", "hold", "predictor", "instrument", "prior", "verdict", "budget",
+             "misfit", "regressor", "residual", "segment", "draw", "lead-in",
+             "closed loop")  # fmt: skip
+    assert not [w for w in asked if w not in words]
+
+
+def test_every_verdict_is_explained():
+    told = text_of("trust.md")
+    assert all(f"| `{verdict}` |" in told for verdict in DiagnosisVerdict)
+    assert all(f"| `Prediction: {level}" in told for level in ("good", "limited", "poor"))
 
 
 def test_every_command_is_described():
