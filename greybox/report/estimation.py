@@ -178,7 +178,7 @@ def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> tuple[Picture, Section
     sentences = [f"{told}: for that, see the table above." if estimate.prediction else f"{told}."]
     if len(logs) > len(drawn):
         sentences.append(f"Of {len(logs)} logs the first {len(drawn)} are drawn.")
-    first = "Of those drawn the one of lowest fit stands" if several else "It is drawn"
+    first = "Of those drawn the one of lowest fit stands" if several else "Its free run is drawn"
     sentences.append(f"{first} at the top of the page.")
     lead = pictures.pop(worst)
     return lead, Section("1. Does its free run follow the log?", sentences, pictures)

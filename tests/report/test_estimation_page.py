@@ -120,7 +120,7 @@ def test_the_free_run_is_told_of_as_many_logs_as_there_are(estimate, log, page):
     one = page.sections[0].sentences
     assert one[0].startswith("The model was fitted to this log, ")
     assert one[0].endswith("see the table above.")
-    assert one[-1] == "It is drawn at the top of the page."
+    assert one[-1] == "Its free run is drawn at the top of the page."
     assert "fits the log it was estimated on" in page.headline
     # without a table there is none to see
     data = replace(estimate.data, logs=4 * estimate.data.logs)
