@@ -70,10 +70,10 @@ def run(options: argparse.Namespace) -> None:
                 f"1.5,1.2,0,0."
             )
         fill = dict(zip(("u", "v", "r", "psi"), values, strict=True))
-    path, *others = [file.path for file in find_logs([options.log])]
-    if others:
+    path, *more = [file.path for file in find_logs([options.log])]
+    if more:
         raise UsageError(
-            f"'{options.log}' holds {1 + len(others)} logs, and one run is of 1: name it, such as "
+            f"'{options.log}' holds {1 + len(more)} logs, and one run is of 1: name it, such as "
             f"'{path}'."
         )
     log = read_log(path, model.vessel, states=model.structure.states, fill=fill, gaps=True)
