@@ -51,9 +51,11 @@ def _meaning(action: argparse.Action, parser: argparse.ArgumentParser) -> str:
     if action.required and action.option_strings:
         said.append("needed")
     if isinstance(action.default, str | int | float) and action.default is not argparse.SUPPRESS:
-        told = str(action.default) in text or isinstance(action.default, bool)
+        default = action.default
+        shown = f"{default:g}" if isinstance(default, float) else str(default)
+        told = shown in text or isinstance(default, bool)
         if not told:
-            said.append(f"default {action.default}")
+            said.append(f"default {shown}")
     if isinstance(action, argparse._AppendAction) and "repeat" not in text:
         said.append("may be repeated")
     return "; ".join(said)
