@@ -10,7 +10,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import max_len_seq
 
 from greybox.trial.log import TrialLog, make_log
 from greybox.vessel.vessel import Vessel
@@ -61,6 +60,9 @@ def prbs(holds: int, commands: int, bits: tuple[int, ...] = (4, 5, 6, 7, 8, 9, 1
     ----------
     Söderström and Stoica (1989), section 5.3.
     """
+    # SciPy's signals take a while to load
+    from scipy.signal import max_len_seq
+
     found = []
     for length in bits:
         sequence = max_len_seq(length)[0].astype(float)

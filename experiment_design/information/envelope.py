@@ -16,7 +16,7 @@ is tr W C: small where the trial moves as the ship will be used, much and long.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -30,6 +30,7 @@ from greybox.model.noise import NoiseLevels
 from greybox.model.predictor import Predictor
 from greybox.model.run.step import StepModel
 from greybox.numerics.linalg import scaled, sizes, trace_with_inverse
+from greybox.numerics.recursion import propagate
 from greybox.numerics.vectorised import Vectorised
 
 Array = NDArray[np.float64]
@@ -115,12 +116,12 @@ class Envelope:
         """
         from scipy.interpolate import make_interp_spline
 
-        rows, every = _sensitivities(self.rollout, self.predictor, self._features, motion)
+        (rows,), every = _sensitivities(self.rollout, self.predictor, self._features, motion)
         p = len(self.predictor.columns)
         beta = np.random.default_rng(53).standard_normal((draws, len(self._precision) - p))
         beta /= np.sqrt(self._precision[p:])
         imitated = beta @ _imitation(self._moments, p).T
-        off = np.stack([np.concatenate([-imitated, beta], axis=1) @ row[0].T for row in rows], 1)
+        off = np.tensordot(np.concatenate([-imitated, beta], axis=1), rows, axes=(1, 2))
         known = np.minimum(every * np.arange(off.shape[1] + 1), motion.tau.shape[1])
         off = np.pad(off, ((0, 0), (1, 0), (0, 0)))
         at = np.arange(motion.tau.shape[1] + 1)
@@ -198,7 +199,7 @@ class Envelope:
             motion.state[which], motion.tau[which], motion.commands[which], motion.stable[which]
         )
         rows, every = _sensitivities(self.rollout, self.predictor, self._features, motion)
-        s = np.stack(list(rows), axis=1) / np.sqrt(self.variance)[:, None]
+        s = rows / np.sqrt(self.variance)[:, None]
         told = [
             part.reshape(len(which), part.shape[1] * part.shape[2], part.shape[3])
             for part in np.array_split(s, parts, axis=1)
@@ -401,7 +402,7 @@ def build_envelope(
     rows, every = _sensitivities(rollout, predictor, features, motion, int(_RUN * scale / dt))
     spread = x.std(axis=0)
     spread[spread == 0] = 1.0
-    s = np.stack(list(rows), axis=1)[inside[:, ::every]]
+    s = rows[inside[:, ::every]]
     moments = tuple(s[:, i].T @ s[:, i] / (len(s) * spread[i] ** 2) for i in range(nx))
     share = np.maximum(misfit, _LEAST_MISFIT)
     tau = _prior_variance(moments, len(predictor.columns), share)
@@ -428,8 +429,8 @@ def _sensitivities(
     features: _Features,
     motion: Motion,
     run: int | None = None,
-) -> tuple[Iterator[Array], int]:
-    """Return sensitivities (R, nx, p + q) of free runs in turn, and samples from one to the next.
+) -> tuple[Array, int]:
+    """Return sensitivities (R, N, nx, p + q) of free runs, and samples from one to the next.
 
     A free run begins anew after `run` samples, by default never. Between two of them the slopes
     and terms of the first stand.
@@ -440,24 +441,22 @@ def _sensitivities(
     x, tau, commands = motion.state[:, at], motion.tau[:, at], motion.commands[:, at]
     z, g = features(x[..., :nx], x[..., nx], tau, commands)
     thinned = Motion(motion.state[:, [*at, -1]], tau, commands, motion.stable)
-    slopes = rollout.slopes(thinned)[:nx, :nx].transpose(3, 2, 0, 1)
+    slopes = rollout.slopes(thinned)[:nx, :nx].transpose(2, 3, 0, 1)
     over, gained = np.broadcast_to(np.eye(nx), slopes.shape), np.zeros(slopes.shape)
     for _ in range(every):
         over, gained = slopes @ over, gained + over
     p, k = len(z), len(g)
-
-    def walk() -> Iterator[Array]:
-        s, pushed = np.zeros((2, len(x), nx, p + nx * k))
-        for j in range(len(at)):
-            for i, name in enumerate(states):
-                rows = predictor.equation(name)
-                pushed[:, i, rows] = z[rows, :, j].T
-                pushed[:, i, p + i * k : p + (i + 1) * k] = g[:, :, j].T
-            begins = run is not None and j % max(1, run // every) == 0
-            s = gained[j] @ pushed + (0.0 if begins else over[j] @ s)
-            yield s
-
-    return walk(), every
+    pushed = np.zeros((*slopes.shape[:3], p + nx * k))
+    for i, name in enumerate(states):
+        rows = predictor.equation(name)
+        by = gained[..., i, None]
+        pushed[..., rows] += by * np.moveaxis(z[rows], 0, -1)[:, :, None]
+        pushed[..., p + i * k : p + (i + 1) * k] = by * np.moveaxis(g, 0, -1)[:, :, None]
+    if run is not None:
+        over = over.copy()
+        over[:, :: max(1, run // every)] = 0.0
+    found = propagate(over, pushed, np.zeros((*pushed.shape[:1], *pushed.shape[2:])))
+    return found[:, 1:], every
 
 
 def _imitation(moments: tuple[Array, ...], p: int) -> Array:

@@ -59,9 +59,9 @@ def trace_with_inverse(weight: Array, matrix: Array) -> float:
     factor, failed = dpotrf(matrix.T, lower=True)
     if failed:
         return np.inf
+    # nothing stands above its diagonal
     inverse = dpotri(factor, lower=True)[0]
-    below = np.tril(inverse, -1)
-    return float(2 * np.sum(weight * below) + np.diagonal(weight) @ np.diagonal(inverse))
+    return float(2 * np.vdot(weight, inverse.T) - np.diagonal(weight) @ np.diagonal(inverse))
 
 
 def quadratic_form(

@@ -73,7 +73,7 @@ def test_the_errors_are_those_of_output_error(envelope) -> None:
     rows, every = _sensitivities(envelope.rollout, envelope.predictor, envelope._features, motion)
     assert every == 1
     # in deviations of the output error
-    s = np.stack([row[0] for row in rows]) / np.sqrt(envelope.variance)[:, None]
+    s = rows[0] / np.sqrt(envelope.variance)[:, None]
     s = s.reshape(-1, s.shape[-1])
     p, draws = len(envelope.predictor.columns), 2000
     rng = np.random.default_rng(2)

@@ -1,7 +1,12 @@
-"""Linear algebra in one thread, and the others given back."""
+"""Linear algebra in one thread, the others given back; memory kept for the next array."""
 
 from __future__ import annotations
 
+import platform
+import subprocess
+import sys
+
+import pytest
 import scipy.linalg  # noqa: F401
 from threadpoolctl import ThreadpoolController, threadpool_info, threadpool_limits
 
@@ -33,3 +38,26 @@ def test_where_one_is_all_nothing_is_set(monkeypatch) -> None:
         monkeypatch.setattr(ThreadpoolController, "limit", None)
         with limit_to_one_thread():
             assert asked(1, to=2) == (3, {1})
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+def test_memory_of_a_large_array_is_kept_for_the_next() -> None:
+    text = """
+import resource
+import numpy as np
+from greybox.numerics.threads import keep_memory
+
+def cleared():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(3):
+        np.ones(6_000_000)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+first = cleared()
+keep_memory()
+np.ones(6_000_000)
+print(first, cleared())
+"""
+    out = subprocess.run([sys.executable, "-c", text], capture_output=True, check=True, text=True)
+    before, after = map(int, out.stdout.split())
+    assert after < before / 10
