@@ -199,10 +199,10 @@ class Envelope:
             motion.state[which], motion.tau[which], motion.commands[which], motion.stable[which]
         )
         rows, every = _sensitivities(self.rollout, self.predictor, self._features, motion)
-        s = rows / np.sqrt(self.variance)[:, None]
+        rows /= np.sqrt(self.variance)[:, None]
         told = [
             part.reshape(len(which), part.shape[1] * part.shape[2], part.shape[3])
-            for part in np.array_split(s, parts, axis=1)
+            for part in np.array_split(rows, parts, axis=1)
         ]
         return every * np.array([part.transpose(0, 2, 1) @ part for part in told])
 
