@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from greybox.diagnosis.causes.cause import Cause, Context
+from greybox.diagnosis.causes.hull import term_parameters
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.model.disturbances import TURNING
-from greybox.model.terms import parameter_unit, parse_term
 from greybox.notebook import with_error
 
 # no current is stronger [m/s]
@@ -78,14 +78,7 @@ class Wind(Cause):
         lacking = context.lacking("Wuu", "Wvv", "Wuv") if context.has_wind else ()
         if not lacking:
             return ()
-        unit = context.vessel.force_unit
-        return (
-            Hypothesis(
-                self.id, self.id,
-                tuple(Parameter(n, parameter_unit(parse_term(n), unit), 0.0) for n in lacking),
-                columns=lacking,
-            ),
-        )  # fmt: skip
+        return (Hypothesis(self.id, self.id, term_parameters(lacking, context), columns=lacking),)
 
     def evidence(self, values: Mapping[str, tuple[float, float]]) -> str:
         """Say which equations feel it."""
