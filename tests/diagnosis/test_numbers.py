@@ -112,6 +112,9 @@ def test_damping_brakes_and_cross_terms_have_no_sign(ready) -> None:
     braking = {"X_uuu", "Y_vvv", "N_rrr", "N_|r|r", "Y_|r|v"}
     assert {n for n, high in most.items() if high == 0} == braking
     assert {"Y_|r|r", "N_|r|v", "Y_r", "N_v"} <= {n for n, h in most.items() if h > 0}
+    # so does the air
+    (wind,) = causes["wind"].hypotheses(replace(context, has_wind=True))
+    assert {p.name: p.high for p in wind.parameters} == {"Wuu": 0.0, "Wvv": 0.0, "Wuv": np.inf}
 
 
 def test_a_cubic_force_that_drives_is_not_called_damping(ready) -> None:
