@@ -133,7 +133,7 @@ def check(kind: Kind, model: ManoeuvringModel, asked: Conditions) -> None:
                         ("--thrusters", asked.thrusters)):  # fmt: skip
         if stops and given:
             raise UsageError(
-                f"{name} belongs to turning and zigzag, a {kind} is straight: leave it out."
+                f"{name} belongs to turning and zigzag; '{kind}' is sailed straight: leave it out."
             )
     for name, value, where in (
         ("--until", asked.until, stops),

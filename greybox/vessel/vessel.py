@@ -259,14 +259,14 @@ class Actuation:
         }  # fmt: skip
         parts = []
         if self.lag:
-            parts.append(f"a lag of {self.lag:g} s of {of.get(self.lag_on, self.lag_on)}")
+            parts.append(f"a lag of {self.lag:.4g} s of {of.get(self.lag_on, self.lag_on)}")
         if self.delay:
             whose = (
                 "" if self.delay_on == "command" else f" of {of.get(self.delay_on, self.delay_on)}"
             )
-            parts.append(f"a delay of {self.delay:g} s{whose}")
+            parts.append(f"a delay of {self.delay:.4g} s{whose}")
         if self.rate_limit is not None:
-            parts.append(f"a rate limit of {self.rate_limit:g} per second of {self.rate_on}")
+            parts.append(f"a rate limit of {self.rate_limit:.4g} per second of {self.rate_on}")
         late = " and ".join(parts) or "no lag and no delay"
         return late if self.between == "held" else f"{late}, interpolated between samples"
 

@@ -114,7 +114,9 @@ class ZigZag(DisplayMixin):
         where = f"from {self.start:.1f} to {self.stop:.1f} s, {len(self.executes)} executes"
         rows: list[tuple[str, Quantity | None]] = [("approach speed", self.approach_speed)]
         checks = list(zip(self.overshoots, self.check_times, strict=True))
-        for i, (angle, time) in enumerate(checks[:_TOLD]):
+        # one more is told as they are, several by their range
+        told = len(checks) if len(checks) == _TOLD + 1 else _TOLD
+        for i, (angle, time) in enumerate(checks[:told]):
             rows += [(f"overshoot {i + 1}", angle), (f"  time to check {i + 1}", time)]
         change = f"{math.degrees(self.initial_turning_angle):.0f} deg"
         rows += [
@@ -123,9 +125,9 @@ class ZigZag(DisplayMixin):
             ("reach", self.reach),
             ("period", self.period),
         ]
-        later = [math.degrees(angle.value) for angle, _ in checks[_TOLD:]]
+        later = [math.degrees(angle.value) for angle, _ in checks[told:]]
         more = (
-            [f"overshoots {_TOLD + 1} to {len(checks)}: {min(later):.1f} to {max(later):.1f} deg"]
+            [f"overshoots {told + 1} to {len(checks)}: {min(later):.1f} to {max(later):.1f} deg"]
             if later
             else []
         )
