@@ -101,7 +101,6 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets
     from greybox.model.catalogue import get_structure, structure_for
     from greybox.model.model import load_model
-    from greybox.numerics.memory import keep_freed_memory
     from greybox.numerics.parallel import ahead
     from greybox.selection.estimate_stream import BYTES
     from greybox.selection.stretches import draw
@@ -112,7 +111,6 @@ def run(options: argparse.Namespace) -> None:
 
     require_ending(options.out, ".json", "a model")
     check_targets(options.out, options.json, options.report)
-    keep_freed_memory()
     vessel = load_vessel(options.vessel)
     model = load_model(options.model).coefficient_model() if options.model else None
     structure = get_structure(options.structure) if model is None else model.structure

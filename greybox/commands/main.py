@@ -19,7 +19,7 @@ from greybox.commands.configuration import configure, find_configuration
 from greybox.commands.parser import Parser, sub_parsers
 from greybox.commands.terminal import complain, telling
 from greybox.errors import GreyboxError, UsageError
-from greybox.numerics.threads import keep_memory
+from greybox.numerics.memory import keep_freed_memory
 from greybox.registry import entry_points
 
 # as the work goes; commands of other packages follow
@@ -189,7 +189,7 @@ def _vessel(options: argparse.Namespace) -> str:
 
 
 def _run(options: argparse.Namespace) -> None:
-    keep_memory()
+    keep_freed_memory()
     if used := options.configuration:
         _log.info("configuration %s gives %s", used["file"], ", ".join(used["options"]))
     require_apart(options)

@@ -45,7 +45,7 @@ def test_memory_of_a_large_array_is_kept_for_the_next() -> None:
     text = """
 import resource
 import numpy as np
-from greybox.numerics.threads import keep_memory
+from greybox.numerics.memory import keep_freed_memory
 
 def cleared():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -54,7 +54,7 @@ def cleared():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 first = cleared()
-keep_memory()
+keep_freed_memory()
 np.ones(6_000_000)
 print(first, cleared())
 """
