@@ -6,7 +6,8 @@ import ctypes
 import sys
 
 # options of glibc's mallopt, by its numbers: how much free memory at its end goes back to the
-# system, and from which size on an array has memory of its own, which goes back when it is freed [B]
+# system, and from which size on an array has memory of its own, which goes back once it is freed
+# [B]
 _KEPT = {-1: 2**28, -3: 2**26}
 
 
