@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.errors import UsageError, suggestion
-from greybox.vessel.vessel import Limits, Thruster, Vessel
+from greybox.trial.manoeuvres.steering import propelling
+from greybox.vessel.vessel import Limits, Vessel
 
 Array = NDArray[np.float64]
 Steering = Literal["rudder", "azimuth", "difference", "tunnel", "none"]
@@ -215,12 +216,7 @@ def _usual(vessel: Vessel, way: Steering, signs: Mapping[str, float]) -> dict[st
 
 
 def _drive(vessel: Vessel, columns: Sequence[str]) -> Array:
-    def along(t: Thruster) -> float:
-        return math.cos(t.angle) if not isinstance(t.angle, str) else 1.0
-
-    speeds = {
-        t.speed: math.copysign(1.0, along(t)) for t in vessel.thrusters if abs(along(t)) > _ALONG
-    }
+    speeds = propelling(vessel)
     greatest = {n: vessel.limits[n].upper for n in speeds}
     stated = all(g is not None and g > 0 for g in greatest.values())
     return np.array(

@@ -184,20 +184,8 @@ def trial_notes(
         )
     if current is not None:
         told.append(current.sentence)
-    driving = [i for i, (n, d) in enumerate(zip(helm.columns, helm.drive, strict=True))
-               if d != 0 and n in log]  # fmt: skip
-    if isinstance(found, TurningCircle) and found.speed_loss is not None and k.any() and driving:
-        last = (log.t >= (found.start + found.stop) / 2) & (log.t <= found.stop)
-        before, after = (
-            float(np.mean([np.sign(helm.drive[i]) * np.median(log[helm.columns[i]][part])
-                           for i in driving]))
-            for part in (k, last)
-        )  # fmt: skip
-        if abs(after - before) > 0.01 * abs(before):
-            told.append(
-                f"the propellers run at {before:.3g} before the order and at {after:.3g} in the "
-                f"turn: the speed loss holds what that change does, not the turn alone."
-            )
+    if isinstance(found, TurningCircle) and found.slowed:
+        told.append(found.slowed)
     if own_start:
         told.append(
             f"the run starts from the trial's own state at the order, "

@@ -114,6 +114,9 @@ def test_a_speed_loss_by_slower_propellers_is_said_to_be_no_loss_of_the_turn(the
     assert (made.manoeuvres[0].quantities["speed_loss"].value > 0.3) == told
     said = "the propellers run at 12 before the order and at 6 in the turn: the speed loss"
     assert any(n.startswith(said) for n in made.notes) == told
+    # a check of the trial says so too
+    (turn,) = find_manoeuvres(log)
+    assert any(n.startswith(said) for n in turn.notes) == told
     assert any("speed loss" in n for n in made.notes) == told
 
 

@@ -17,6 +17,7 @@ from greybox.trial.manoeuvres.local import noise_std
 from greybox.trial.manoeuvres.steering import (
     Held,
     held_angles,
+    propelling,
     sideways,
     speed_difference,
     steering_angle,
@@ -154,7 +155,8 @@ def find_manoeuvres(log: TrialLog, *, scale: float = 1.0) -> tuple[Manoeuvre, ..
         found += zigzags
         found += _beside(_turns(log, signals, angle, held, greatest, rudder), zigzags)
     found += _beside(_stops(log, signals), found)
-    return tuple(sorted(_of_antenna(found, log), key=lambda m: m.start))
+    told = (_with_propellers(m, log) for m in _of_antenna(found, log))
+    return tuple(sorted(told, key=lambda m: m.start))
 
 
 def _beside(found: Iterable[Manoeuvre], others: Sequence[Manoeuvre]) -> list[Manoeuvre]:
@@ -176,6 +178,24 @@ def _of_antenna(found: Sequence[Manoeuvre], log: TrialLog) -> Iterator[Manoeuvre
                 note += f", whose drift angle is {turned:.2g} deg larger for each metre abaft"
             m = replace(m, notes=(*m.notes, f"{note} (add antenna = [x, y] to [sensors])"))
         yield m
+
+
+def _with_propellers(found: Manoeuvre, log: TrialLog) -> Manoeuvre:
+    """Return a turn with the speeds of the propellers before and in it, others as they are."""
+    driving = {n: sign for n, sign in propelling(log.vessel).items() if n in log}
+    if not isinstance(found, TurningCircle) or not driving:
+        return found
+    run = found.length / max(found.approach_speed.value, 1e-9)
+    before = (log.t >= found.start - run) & (log.t < found.start)
+    late = (log.t >= (found.start + found.stop) / 2) & (log.t <= found.stop)
+    if not before.any():
+        return found
+    first, last = (
+        float(np.mean([sign * np.median(log[n][part]) for n, sign in driving.items()]))
+        for part in (before, late)
+    )
+    found = replace(found, propellers=(first, last))
+    return replace(found, notes=(*found.notes, found.slowed)) if found.slowed else found
 
 
 def _signals(log: TrialLog) -> _Signals | None:

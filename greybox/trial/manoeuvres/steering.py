@@ -12,7 +12,7 @@ from scipy import ndimage
 from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres.local import noise_std
 from greybox.trial.raw_log import Array, Mask
-from greybox.vessel.vessel import Vessel
+from greybox.vessel.vessel import Thruster, Vessel
 
 _TOLERANCE = math.radians(1.0)
 # angle between azimuth thrusters above which they push against one another [rad]
@@ -68,6 +68,17 @@ def steering_angle(log: TrialLog) -> tuple[Array, float | None] | None:
     if azimuths and all(name in log for name in azimuths):
         return np.mean(_deviations(log, azimuths), axis=0), None
     return None
+
+
+def propelling(vessel: Vessel) -> dict[str, float]:
+    """Return the speed columns of the propellers that drive a vessel, with the sign ahead."""
+
+    def along(t: Thruster) -> float:
+        return math.cos(t.angle) if not isinstance(t.angle, str) else 1.0
+
+    return {
+        t.speed: math.copysign(1.0, along(t)) for t in vessel.thrusters if abs(along(t)) > _ALONG
+    }
 
 
 def speed_difference(log: TrialLog) -> Array | None:

@@ -32,6 +32,8 @@ _STEADY_FROM, _STEADY_LEAST = math.pi, math.pi / 2
 _DRIFT_RANGE = math.radians(300)
 # change of the yaw rate between the halves of a turn up to which it is steady, relative
 _STEADY = 0.05
+# change of the propellers' speed up to which they run on, relative
+_SAME_SPEED = 0.01
 
 
 @dataclass(frozen=True, repr=False)
@@ -73,6 +75,9 @@ class TurningCircle(DisplayMixin):
         What limits the measurement, one sentence each.
     yaw_rate_change : float or None
         Of the steady turn, from its first half to its second, relative.
+    propellers : (float, float) or None
+        Their mean speed over the ship length before the order and in the second half of the
+        turn, in the unit of the log; None where none is logged.
 
     References
     ----------
@@ -103,6 +108,20 @@ class TurningCircle(DisplayMixin):
     criteria: tuple[Criterion, ...]
     notes: tuple[str, ...]
     yaw_rate_change: float | None = None
+    propellers: tuple[float, float] | None = None
+
+    @property
+    def slowed(self) -> str:
+        """What is to be said of a speed loss that is not of the turn alone; empty of others."""
+        if self.speed_loss is None or self.propellers is None:
+            return ""
+        before, after = self.propellers
+        if abs(after - before) <= _SAME_SPEED * abs(before):
+            return ""
+        return (
+            f"the propellers run at {before:.3g} before the order and at {after:.3g} in the turn: "
+            f"the speed loss holds what that change does, not the turn alone"
+        )
 
     @property
     def unsteady(self) -> str:
