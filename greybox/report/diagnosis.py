@@ -22,6 +22,7 @@ from greybox.report.diagnosis_figures import (
 )
 from greybox.report.error_budget import (
     budget_figure,
+    budget_in_words,
     budget_table,
     cut_off,
     largest,
@@ -156,25 +157,28 @@ def _wrong(diagnosis: Diagnosis) -> Section:
         "1. What the simulation gets wrong",
         sentences,
         pictures,
-        [*_tests(diagnosis, "before"), *([budget_table(b)] if (b := diagnosis.budget) else [])],
+        [
+            *_tests(diagnosis, "before"),
+            *([budget_table(b)] if (b := budget_in_words(diagnosis)) else []),
+        ],
         points=[s.sentence for s in diagnosis.wrong],
     )
 
 
 def _budget(diagnosis: Diagnosis) -> Iterator[Picture]:
     """Yield whose the squared error is."""
-    if diagnosis.budget:
+    if budget := budget_in_words(diagnosis):
         caption = (
             "Sources of the squared error of the held-out free run, before and after the model is "
             "extended; the part of a cause is how much smaller the error would be without it."
         )
-        if not all(is_split(p, state) for p in diagnosis.budget for state in p.share):
+        if not all(is_split(p, state) for p in budget for state in p.share):
             caption += " Shares that the logs cannot split are not drawn."
-        if cut_off(diagnosis.budget):
+        if cut_off(budget):
             caption += " Shares beyond the picture's edge stand in the table of the budget."
-        caption += f" {told}" if (told := hardly_split(diagnosis.budget)) else ""
-        told = f"{caption} Largest part of {largest(diagnosis.budget)}."
-        yield narrow(budget_figure(diagnosis.budget), "budget", caption, told)
+        caption += f" {told}" if (told := hardly_split(budget)) else ""
+        told = f"{caption} Largest part of {largest(budget)}."
+        yield narrow(budget_figure(budget), "budget", caption, told)
 
 
 def _tests(diagnosis: Diagnosis, when: str) -> list[Table]:

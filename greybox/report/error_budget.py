@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from textwrap import fill
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,8 +18,25 @@ from greybox.validation.fit import fit_percent
 
 # inches: letters stay legible where the page is 390 px wide
 _WIDTH = 4.4
+# in a line of a part's name
+_LETTERS = 22
 # shares in percent that are drawn; what lies beyond is cut off
 _SHOWN = (-60.0, 140.0)
+
+
+def budget_in_words(diagnosis: Diagnosis) -> list[BudgetPart]:
+    """Return the parts of the budget with the titles of causes in place of their ids.
+
+    Where causes of one title have parts, each title is followed by its place.
+    """
+    found = {name: c for c in diagnosis.causes for name in (c.id, c.key)}
+    parts = {p.part: found[p.part] for p in diagnosis.budget if p.part in found}
+    titles = [c.title for c in parts.values()]
+    told = {
+        part: f"{c.title} ({c.key.partition(':')[2]})" if titles.count(c.title) > 1 else c.title
+        for part, c in parts.items()
+    }
+    return [replace(p, part=told.get(p.part, p.part)) for p in diagnosis.budget]
 
 
 def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
@@ -42,7 +61,8 @@ def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
         ax.tick_params(axis="x", labelsize=8)
         ax.set_title(LABELS.get(state, state).split(" [")[0], fontsize=9)
         tidy(ax)
-    axes[0].set_yticks(places, [p.part for p in budget], fontsize=8.5)
+    names = [fill(p.part, _LETTERS, break_long_words=False) for p in budget]
+    axes[0].set_yticks(places, names, fontsize=8.5)
     axes[0].set_ylim(len(budget) - 0.4, -0.6)
     figure.supxlabel("share of the squared error before the extension [%]", fontsize=9)
     legend_outside(figure, axes[0], "upper left", 3, handlelength=1.4, columnspacing=1.0)

@@ -29,7 +29,7 @@ from greybox.notebook import with_error
 from greybox.report.diagnosed_causes import probability
 from greybox.report.diagnosis import diagnosis_page
 from greybox.report.diagnosis_figures import command_figure, most_followed
-from greybox.report.error_budget import budget_figure, budget_table, largest
+from greybox.report.error_budget import budget_figure, budget_in_words, budget_table, largest
 from greybox.report.error_profiles import block_ids, memory, profile
 from greybox.report.free_run_errors import gather
 from greybox.report.model_difference import (
@@ -265,6 +265,20 @@ def test_whose_the_error_is_stands_in_bars_and_numbers(told):
     assert "that is left: surge 33 %, sway 33 %, yaw rate 33 %" in said
     surge = np.concatenate([run.measured["u"] for run in named.runs if run.held_out])
     assert f"about surge {100 * (1 - 0.014 / surge.std()):.0f} %" in said
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_causes_of_the_budget_have_their_titles():
+    own = replace(CURRENT, id="thruster_lag:n", key="thruster_lag:n", title="slow thrusters")
+    other = replace(own, id="thruster_lag:alpha1", key="thruster_lag:alpha1")
+    parts = [BUDGET[0], *(replace(BUDGET[1], part=c.id) for c in (own, other)), BUDGET[2]]
+    named = replace(diagnosis_of("named"), budget=tuple(parts))
+    for causes, first in (((own,), "slow thrusters"), ((own, other), "slow thrusters (n)")):
+        told = replace(named, causes=causes)
+        rows = budget_table(budget_in_words(told)).rows
+        assert [row[0] for row in rows[:2]] == ["sensor noise", first]
+        assert f"surge u: {first} 70 %" in diagnosis_page(told, RECORD).lead.alternative
+    assert told.to_dict()["budget"][1]["part"] == "thruster_lag:n"
 
 
 @pytest.mark.usefixtures("undrawn")
