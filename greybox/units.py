@@ -138,7 +138,9 @@ def unit_factor(unit: str, target: str | None, name: str) -> float:
     """
     found = find_unit(unit)
     if found is None:
-        near = suggestion(unit, [*UNITS, *_SPELLED])
+        wanted = "rad" if target == "deg" else target
+        words = {**dict.fromkeys(UNITS), **_SPELLED}
+        near = suggestion(unit, (w for w in words if wanted in (None, unit_dimension(w))))
         raise LogError(
             f"column '{name}' has the unknown unit '{unit}'.{near} "
             f"Known units: {', '.join(sorted(UNITS))}."

@@ -64,6 +64,14 @@ def test_factors_and_dimensions():
     assert find_unit("1").si == "1"
     with pytest.raises(LogError, match=r"'u' has the unknown unit 'knot/s'.*Did you mean"):
         unit_factor("knot/s", "m/s", "u")
+    # the nearest of its own dimension
+    for channel, unit, near in (
+        ("psi", "rad", "deg"),
+        ("lat", "deg", "deg"),
+        ("r", "rad/s", "degps"),
+    ):
+        with pytest.raises(LogError, match=rf"Did you mean '{near}'\?"):
+            unit_factor("degs", unit, channel)
     with pytest.raises(LogError, match=r"'u' is in 'deg' but its channel is in 'm/s'"):
         unit_factor("deg", "m/s", "u")
 

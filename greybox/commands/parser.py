@@ -81,12 +81,12 @@ class Parser(argparse.ArgumentParser):
                 f"{suggestion(value, known)} Known: {', '.join(known)}"
             )
 
-    def _wanted(self, name: str) -> str:
-        """Return what is missing, with what it is."""
+    def _wanting(self, name: str, lacks: str) -> str:
+        """Return what an argument lacks, with what it is."""
         action = next(a for a in self._actions if argparse._get_action_name(a) == name)
         told = (action.help or "").replace("%%", "%").split(";")[0]
         known = f" ({', '.join(map(str, action.choices))})" if action.choices else ""
-        return f"{name} is missing{': ' * bool(told)}{told}{known}"
+        return f"{name} {lacks}{': ' * bool(told)}{told}{known}"
 
     def _in_its_place(self, option: str) -> str:
         """Return how what an unknown option names is given."""
@@ -112,7 +112,9 @@ class Parser(argparse.ArgumentParser):
         if found := re.match("unrecognized arguments: ([^ =]*)", message):
             message = f"there is no option '{found[1]}'{self._in_its_place(found[1])}"
         if found := re.match("the following arguments are required: (.*)", message):
-            message = "; ".join(self._wanted(name) for name in found[1].split(", "))
+            message = "; ".join(self._wanting(n, "is missing") for n in found[1].split(", "))
+        if found := re.match(r"argument (\S+): expected (\d+) arguments$", message):
+            message = self._wanting(found[1], f"needs {found[2]} values")
         message += "." * (not message.endswith((".", "?")))
         if self.place:
             raise ConfigurationError(f"{self.place}: {re.sub('^argument [^:]*: ', '', message)}")

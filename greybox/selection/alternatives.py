@@ -93,10 +93,14 @@ def alternatives_for(
         Alternative(s, e.name, k) for s in structures for e in estimators for k in kinds
     ]
     if all(e.free_run for e in estimators):
-        reason = (
-            "a free run feels the mean current itself, so it needs no sign condition, and the "
-            "first structure whose run stays bounded is kept"
-        )
+        reasons = []
+        if request.predictor is None:
+            reasons.append(
+                "a free run feels the mean current itself, so it needs no sign condition"
+            )
+        if request.structure is None:
+            reasons.append("the first structure whose run stays bounded is kept")
+        reason = ", and ".join(reasons)
         alternatives = [replace(a, reason=reason) for a in alternatives if a.kind == kinds[0]]
     elif len(alternatives) > 1:
         theory = _theory(logs, structures[0], wind)

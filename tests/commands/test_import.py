@@ -527,6 +527,7 @@ def test_channels_are_smoothed_where_asked(tmp_path, capsys, monkeypatch, limite
         ("r=x", "'x', it must be a positive"), ("r=1e999", "'1e999', it must be a positive"),
         ("psy=4", "'psy' cannot be smoothed, for the log has no such channel. Did you mean 'psi'?"),
         ("t=4", "'t' cannot be smoothed, for the log has no such channel"),
+        ("rr=1", "'rr' cannot be smoothed, for the log has no such channel. Did you mean 'r'?"),
         ("r=1", "r cannot be smoothed: a window of 1 s holds 3 samples of 0.5 s, order 2 needs 4"),
         ("r=50", "a window of 50 s holds 101 samples, the log has 60: use a window of at most 29"),
         ("r=25", "no 51 that follow each other"),

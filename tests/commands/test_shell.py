@@ -142,6 +142,10 @@ def test_the_parser_imports_nothing_heavy():
         ("completion bsh", "Did you mean 'bash'?"),
         ("simulate m.json a.csv --out c --start -1,0,0,0", "--start has no value: write it behind"),
         ("compare m.json --log", "--log has no value: write it behind"),
+        (
+            "design --vessel s --between a.json --out p.csv",
+            "--between needs 2 values: two models for the trial to tell apart.",
+        ),
         ("reproduce chapter4 --workers -2", "'-2' is no whole number of at least 1."),
     ],
 )

@@ -42,6 +42,8 @@ def test_an_estimate_in_its_family_predicts(estimate, logs):
     assert sorted(found.logs) == [log.name for log in logs]
     assert found.samples == 1500
     assert set(found.fit) == set(found.coverage) == {"u", "v", "r"}
+    # nothing was left to choose
+    assert not any("was chosen" in note for note in estimate.notes)
     assert estimate.summary().splitlines()[2:4] == [
         "Prediction: good", f"Coefficients: {estimate.verdict.text}"
     ]  # fmt: skip

@@ -354,6 +354,12 @@ def test_paths_that_are_no_files(tmp_path):
     (tmp_path / "log.xyz").write_text("t,u\n1,2\n")
     with pytest.raises(LogError, match="no known format"):
         open_raw(tmp_path / "log.xyz")
+    # a shell that expands log* names the record too
+    (tmp_path / "log.csv.json").write_text("{}")
+    with pytest.raises(
+        LogError, match=r"is the record of 'log.csv', .* logs alone, such as \*.csv"
+    ):
+        open_raw(tmp_path / "log.csv.json")
 
 
 def test_parquet_types(tmp_path):

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from greybox.channels import LOGGED
 from greybox.errors import LogError
 from greybox.trial.convert.derived_signals import (
     BODY,
@@ -280,6 +281,9 @@ def _windows(
     if options.velocities == "savgol" and made_from_positions(names):
         yield window_samples(count, sample_time, options.window, POSITION_ORDER)
     for name, seconds in options.smooth.items():
+        # that a log has no such channel is said where all of its channels are known
+        if name not in names and name not in LOGGED:
+            continue
         try:
             yield window_samples(count, sample_time, seconds)
         except LogError as error:

@@ -181,6 +181,11 @@ def _kind(path: Path) -> str:
         return kind
     if kind == "nmea" and b"$" not in head:
         kind = "csv"
+    if not kind and suffix == ".json" and path.with_suffix("").is_file():
+        raise LogError(
+            f"'{path.name}' is the record of '{path.stem}', not a log: name the logs alone, such "
+            f"as *{path.with_suffix('').suffix}."
+        )
     if not kind:
         known = sorted(filter(None, _KINDS))
         raise LogError(
