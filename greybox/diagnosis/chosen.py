@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.causes.hull import is_coupling, term_parameters
 from greybox.diagnosis.causes.sensors import abeam
+from greybox.diagnosis.evidence.held_out import worse
 from greybox.diagnosis.evidence.kinematics import denied
 from greybox.diagnosis.fitting import Problem, stacked
 from greybox.diagnosis.hypothesis import Hypothesis
@@ -130,7 +131,7 @@ def from_chosen(
         starts.append(_holding(case, _start(ready, case, choice, chosen, base), late))
     fit, *rest = _bounded(case, starts, plain.noise)
     by_data = rest[0] if rest else None
-    if by_data is not None and (fit is None or _nearer(case, by_data, fit)):
+    if by_data is not None and (fit is None or worse(case.held_out, by_data, fit) < 0):
         fit, named, hypotheses = by_data, chosen, tuple(every)
     if fit is None:
         return None
@@ -148,7 +149,8 @@ def from_chosen(
         other, base=base, tried=len(hypotheses), chosen=by_data,
         nearest=None if plain.escaped else plain,
     )  # fmt: skip
-    return (case, mine) if _nearer(case, mine.final, case.carried(found.final)) else None
+    nearer = worse(case.held_out, mine.final, case.carried(found.final)) < 0
+    return (case, mine) if nearer else None
 
 
 def _late(case: DiagnosisProblem, found: Search) -> list[Candidate]:
@@ -332,7 +334,7 @@ def _best_of(
 
     def work(k: int) -> tuple[Fit, bool]:
         found = problem.settle(problem.fit(points[k], fit.noise), SETTLE)
-        return found, not found.escaped and _nearer(case, found, fit)
+        return found, not found.escaped and worse(case.held_out, found, fit) < 0
 
     price = np.log(problem.counts.sum())
     best: tuple[Fit, list[Hypothesis]] | None = None
@@ -342,12 +344,6 @@ def _best_of(
         if nearer and found.cost + dearer < least.cost:
             best = found, causes
     return best
-
-
-def _nearer(case: DiagnosisProblem, fit: Fit, other: Fit) -> bool:
-    """Whether a fit follows the held-out logs more nearly than another one."""
-    one, two = (case.held_out(f.integrator).squares(f) for f in (other, fit))
-    return bool(np.log(two).mean() < np.log(one).mean())
 
 
 def _hypotheses(

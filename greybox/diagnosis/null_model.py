@@ -26,7 +26,7 @@ from greybox.numerics.parallel import map_forked
 from greybox.regression.regression import build_regression
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.log import TrialLog
-from greybox.trial.segments import continues
+from greybox.trial.segments import of_one_log
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -53,17 +53,10 @@ Clock = tuple[float, float]
 
 def clocks_of(logs: Sequence[TrialLog]) -> list[Clock]:
     """Return the clock that changes count on, of each log: that of the whole log of a segment."""
-    wholes: list[list[TrialLog]] = []
-    for log in logs:
-        before = wholes[-1][-1] if wholes else None
-        if before is not None and continues(before, log):
-            wholes[-1].append(log)
-        else:
-            wholes.append([log])
     return [
-        (float(parts[0].t[0]), float(parts[-1].t[-1] - parts[0].t[0]))
-        for parts in wholes
-        for _ in parts
+        (float(logs[places[0]].t[0]), float(logs[places[-1]].t[-1] - logs[places[0]].t[0]))
+        for places in of_one_log(logs)
+        for _ in places
     ]
 
 

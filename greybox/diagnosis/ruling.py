@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.evidence.held_out import HeldOut, Pair, proof_of
+from greybox.diagnosis.evidence.held_out import HeldOut, Pair, proof_of, worse
 from greybox.diagnosis.evidence.omnibus import Omnibus, disagreement, omnibus
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain, file_word
@@ -114,7 +114,7 @@ def rule(
         anew = _other_coefficients(diagnosed, held_out(found.base.integrator).pairs(found.base))
         why = anew
     if not (why or stand or known) and final is not found.base:
-        taken = 1 - np.exp(held_out(final.integrator).worse(final, found.base))
+        taken = 1 - np.exp(worse(held_out, final, found.base))
         why = (
             f"terms of motion and commands that belong to no known cause lower the squared error "
             f"of the "
@@ -130,7 +130,7 @@ def rule(
     else:
         verdict = DiagnosisVerdict.UNEXPLAINED if why else DiagnosisVerdict.NONE
     # of the squared error that the diagnosed model had
-    kept = float(np.exp(held_out(final.integrator).worse(final, found.before))) if stand else 1.0
+    kept = float(np.exp(worse(held_out, final, found.before))) if stand else 1.0
     return Ruling(
         verdict, named, leaning, _remaining(final, pairs, left, why, kept, waves),
         _next(verdict, groups, bool(anew)), first, left, final, tuple(notes),

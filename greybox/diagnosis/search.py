@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.causes.sensors import alike_to_forces
-from greybox.diagnosis.evidence.held_out import HeldOut, Proof, proof_of
+from greybox.diagnosis.evidence.held_out import HeldOut, Proof, proof_of, worse
 from greybox.diagnosis.evidence.omnibus import omnibus
 from greybox.diagnosis.evidence.remainder import MOTION_AND_COMMANDS, contributions_beside
 from greybox.diagnosis.evidence.standing import Standing, level_of, standing
@@ -514,7 +514,7 @@ def _needed(case: DiagnosisProblem, fit: Fit, without: Fit) -> bool:
     """
     if case.metric != "free run":
         return False
-    return without.escaped or case.held_out(fit.integrator).worse(without, fit) > np.log1p(WORTH)
+    return without.escaped or worse(case.held_out, without, fit) > np.log1p(WORTH)
 
 
 def _of_the_ship(case: DiagnosisProblem, fit: Fit, cause: Candidate) -> bool:

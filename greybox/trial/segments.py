@@ -73,7 +73,18 @@ def join_segments(segments: Sequence[TrialLog], name: str) -> TrialLog:
     )
 
 
-def continues(before: TrialLog, log: TrialLog) -> bool:
+def of_one_log(logs: Sequence[TrialLog]) -> list[list[int]]:
+    """Return the places of logs, those of neighbouring segments of one log together."""
+    out: list[list[int]] = []
+    for k, log in enumerate(logs):
+        if out and _continues(logs[k - 1], log):
+            out[-1].append(k)
+        else:
+            out.append([k])
+    return out
+
+
+def _continues(before: TrialLog, log: TrialLog) -> bool:
     """Whether a log is a later segment of the one that another one is a segment of."""
     return (
         whole_name(before.name) == whole_name(log.name) != log.name

@@ -23,9 +23,9 @@ from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import (
     LogGaps,
-    continues,
     find_log_gaps,
     join_segments,
+    of_one_log,
     split_segments,
 )
 
@@ -339,13 +339,7 @@ def average_fit(fits: Sequence[LogFit]) -> dict[str, float]:
 
 def by_log(fits: Sequence[LogFit]) -> list[list[LogFit]]:
     """Group the runs on neighbouring segments of one log."""
-    groups: list[list[LogFit]] = []
-    for run in fits:
-        if groups and continues(groups[-1][-1].log, run.log):
-            groups[-1].append(run)
-        else:
-            groups.append([run])
-    return groups
+    return [[fits[k] for k in places] for places in of_one_log([run.log for run in fits])]
 
 
 def _joined(runs: Sequence[LogFit]) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scipy.stats import chi2
 
 from greybox.diagnosis import search as searching
 from greybox.diagnosis.diagnose import diagnose
-from greybox.diagnosis.evidence.held_out import OtherLogs, Pair, proof_of
+from greybox.diagnosis.evidence.held_out import HeldOut, OtherLogs, Pair, proof_of, worse
 from greybox.diagnosis.evidence.omnibus import disagreement
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.scores import MOMENTS
@@ -21,6 +22,7 @@ from greybox.diagnosis.ship import LogRun
 from greybox.numerics.recursion import propagate
 from greybox.study.blind import draw
 from greybox.trial.log import TrialLog
+from greybox.trial.segments import split_segments
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +90,48 @@ def test_held_out_errors_have_a_colour_of_their_own(changed: TrialLog) -> None:
     before, after = (noise.groups[0].sensor[0] for noise in (fit.noise, pair.held_fit.noise))
     assert before == pytest.approx(0.014, rel=0.2)
     assert after == pytest.approx(0.101, rel=0.1)
+
+
+def test_each_held_out_log_counts_alike_and_segments_of_one_log_once(changed: TrialLog) -> None:
+    rows = np.arange(len(changed)) % 600 != 300
+    gap = replace(
+        changed,
+        t=changed.t[rows],
+        channels={n: c[rows] for n, c in changed.channels.items()},
+        closed_loop=changed.closed_loop[rows],
+    )
+    logs = [*split_segments(gap), replace(changed, name="rough")]
+    assert len(logs) > 2
+
+    def run(own: float, rough: float) -> SimpleNamespace:
+        sizes = [own] * (len(logs) - 1) + [rough]
+        return SimpleNamespace(
+            integrator="rk4",
+            errors=[np.full((len(g), 3), size) for g, size in zip(logs, sizes, strict=True)],
+        )
+
+    held = SimpleNamespace(
+        structure=SimpleNamespace(states=("u", "v", "r")),
+        runs=[SimpleNamespace(log=log) for log in logs],
+    )
+
+    class Given(HeldOut):
+        def _pairs(self, fit):
+            raise AssertionError
+
+        def pairs(self, fit):
+            return [SimpleNamespace(held=held, held_fit=fit)]
+
+    known, one, two = Given(), run(0.1, 10.0), run(0.2, 9.0)
+    assert known.squares(one).shape == (2, 3)
+    assert known.squares(one)[0] == pytest.approx(len(gap) * 0.01)
+    # the squares of both logs together are smaller, and yet most of what was predicted is worse
+    assert known.squares(two).sum() < known.squares(one).sum()
+    assert worse(lambda _: known, two, one) == pytest.approx(np.log(2.0) + np.log(0.9))
+    away = run(np.inf, 10.0)
+    assert worse(lambda _: known, away, one) == np.inf
+    assert worse(lambda _: known, one, away) == -np.inf
+    assert worse(lambda _: known, away, away) == 0.0
 
 
 def test_causes_that_take_each_others_place_end_the_search(

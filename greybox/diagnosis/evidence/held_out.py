@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import Ship
+from greybox.model.run.step import Integrator
 from greybox.numerics.lagged_moments import correlation_factor
+from greybox.trial.segments import of_one_log
 
 Array = NDArray[np.float64]
 
@@ -95,20 +97,18 @@ class HeldOut(ABC):
         return np.concatenate(out)
 
     def squares(self, fit: Fit) -> Array:
-        """Return the squared error of each state, (nx,); infinite where a run has no bound."""
-        pairs = self.pairs(fit)
-        count = len(pairs[0].held.structure.states)
-        total = np.zeros(count)
-        for errors in (e for p in pairs for e in p.held_fit.errors):
-            total += (errors[:, :count] ** 2).sum(axis=0)
-        return np.maximum(np.where(np.isfinite(total), total, np.inf), 1e-300)
+        """Return the squared error of each log and state, (logs, nx).
 
-    def worse(self, fit: Fit, than: Fit) -> float:
-        """Return the mean logarithm of the ratio of squared errors of two fits."""
-        one, two = self.squares(fit), self.squares(than)
-        if not np.isfinite(two).all():
-            return -np.inf if np.isfinite(one).all() else 0.0
-        return float(np.log(one / two).mean())
+        Infinite where a run has no bound.
+        """
+        out = []
+        for pair in self.pairs(fit):
+            count = len(pair.held.structure.states)
+            each = np.array([(e[:, :count] ** 2).sum(axis=0) for e in pair.held_fit.errors])
+            places = of_one_log([run.log for run in pair.held.runs])
+            out += [each[of_one].sum(axis=0) for of_one in places]
+        total = np.array(out)
+        return np.maximum(np.where(np.isfinite(total), total, np.inf), 1e-300)
 
     def prove(self, before: Fit, after: Fit) -> Proof:
         """Return what the second hypothesis gains on the first."""
@@ -120,6 +120,18 @@ class HeldOut(ABC):
     def _ways(self, fit: Fit) -> int:
         """Return among how many readings of a hypothesis the likeliest was taken."""
         return 1
+
+
+def worse(held_out: Callable[[Integrator], HeldOut], fit: Fit, than: Fit) -> float:
+    """Return the mean logarithm of the ratio of squared held-out errors of two fits.
+
+    Each is run as it was fitted. Each log counts alike, as in the fit that is told: the squares of
+    the roughest would outweigh those of all others.
+    """
+    one, two = (held_out(f.integrator).squares(f) for f in (fit, than))
+    if not np.isfinite(two).all():
+        return -np.inf if np.isfinite(one).all() else 0.0
+    return float(np.log(one / two).mean())
 
 
 def proof_of(difference: Array) -> Proof:
