@@ -77,6 +77,21 @@ def test_a_folder_is_compared_and_checked_file_by_file(folder, tmp_path):
     assert len(json.loads(out.read_text())["logs"]) == 3
 
 
+def test_what_is_noted_of_all_logs_is_told_once(folder, tmp_path, capsys):
+    raw = tmp_path / "raw"
+    raw.mkdir()
+    for log in folder.glob("*.csv"):
+        named = log.read_text().replace("psi", "Gyro heading [rad]", 1)
+        (raw / log.name).write_text(named)
+    assert main(["check", str(raw), "--vessel", "thesis"]) == 0
+    out = capsys.readouterr().out
+    told = "Gyro heading [rad] taken for psi in rad"
+    assert out.count(told) == 1
+    assert f"note on all 3 logs: {told}\n" in out
+    assert main(["check", str(raw / "day0.csv"), "--vessel", "thesis"]) == 0
+    assert f"  note: {told}\n" in capsys.readouterr().out
+
+
 def test_a_comparison_counts_each_trial_once_and_names_what_is_no_log(folder, tmp_path, capsys):
     model, log = tmp_path / "m.json", folder / "day0.csv"
     main(["estimate", str(log), *OPTIONS, "--out", str(model)])

@@ -180,8 +180,8 @@ class CheckReport(DisplayMixin):
         """Return the findings as text."""
         return self.summary_beside(())
 
-    def summary_beside(self, told: Sequence[Finding]) -> str:
-        """Return the findings as text; of those that were shown before, only the size."""
+    def summary_beside(self, told: Sequence[Finding], notes: Sequence[str] = ()) -> str:
+        """Return findings and notes as text; of findings that were told before only the size."""
         count = len(self.findings)
         untold = sum(o.status == "cannot tell" for o in self.outcomes)
         verdict = f"{count} finding{'s' if count > 1 else ''}" if count else "clean"
@@ -194,7 +194,7 @@ class CheckReport(DisplayMixin):
             lines += [f"  {line}" for line in text.splitlines()]
         lines += [f"  {o.id}: {o.sentence}" for o in self.outcomes if o.status == "cannot tell"]
         lines += [f"  actuator: {a.sentence}" for a in self.actuators]
-        lines += [f"  note: {n}" for n in self.notes]
+        lines += [f"  note: {n}" for n in self.notes if n not in notes]
         return "\n".join(lines)
 
     def _parts(self) -> tuple[str, ...]:
@@ -233,6 +233,12 @@ def shared_findings(reports: Sequence[CheckReport]) -> list[Finding]:
             if len(f.logs) > 1:
                 found.setdefault(f.key, f)
     return list(found.values())
+
+
+def shared_notes(reports: Sequence[CheckReport]) -> list[str]:
+    """Return the notes that all of several logs have."""
+    first, *others = reports
+    return [n for n in first.notes if others and all(n in r.notes for r in others)]
 
 
 def size_in_words(f: Finding) -> str:
