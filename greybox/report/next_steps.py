@@ -62,9 +62,10 @@ def after_import(out: str, vessel: str, lacking: Sequence[str] = ()) -> NextStep
         why = {"psi": "sway and yaw need the heading"}.get(
             lacking[0], "a model needs what moves the thrusters"
         )
+        columns, unit = ("columns", "their units") if len(lacking) > 1 else ("column", "its unit")
         return NextStep(
-            f"Name the raw column of {' and that of '.join(lacking)}, with its unit, in the vessel "
-            f"file's [columns], and import again: {why}"
+            f"Name the raw {columns} of {', '.join(lacking)}, with {unit}, in the vessel file's "
+            f"[columns], and import again: {why}"
         )
     return NextStep(
         "See whether sensors and the vessel file are right",

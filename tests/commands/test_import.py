@@ -180,7 +180,7 @@ def test_a_thruster_column_that_is_misspelt_gets_its_name_and_comes_before_the_c
     assert "greybox check" not in out
     raw.rename(columns={"psi": "Compass"}).to_csv(tmp_path / "raw.csv", index=False)
     _, out, _ = run(capsys, *given)
-    assert "next: name the raw column of psi and that of aft, with its unit" in out
+    assert "next: name the raw columns of psi, aft, with their units" in out
 
 
 def sparse(path):

@@ -23,7 +23,7 @@ _GUESSES: dict[str, tuple[str, ...]] = {
           "date_time", "epoch", "gps_time", "time_unix", "utc_time", "time_utc", "time_stamp",
           "local_time", "time_local", "uhrzeit", "stamp", "zeit", "tid", "clock"),
     "psi": ("psi", "heading", "hdg", "true_heading", "heading_true", "yaw", "yaw_angle", "head",
-            "hdt"),
+            "hdt", "gyro_heading", "heading_gyro", "compass_heading"),
     "x_n": ("x_n", "x_ned", "north", "northing", "pos_n", "pos_north", "position_north",
             "north_position", "p_n", "pn", "x_north", "x0", "x_earth", "x_position", "x_pos",
             "pos_x", "position_x", "x"),
