@@ -16,11 +16,14 @@ if TYPE_CHECKING:
     from greybox.model.model import ManoeuvringModel
     from greybox.prediction.result import ManoeuvrePrediction
     from greybox.trial.checks.finding import CheckReport
+    from greybox.trial.raw_log import Recording
     from greybox.validation.comparison import Comparison
     from greybox.vessel.vessel import Vessel
 
 # files that a command line is still read with
 _MOST_TYPED = 3
+# what logs are files of
+_TABLES = {"CSV", "Parquet"}
 _DOUBTED = (PredictionLevel.LIMITED, PredictionLevel.POOR)
 
 
@@ -129,6 +132,12 @@ def _use(model: str) -> NextStep:
     )
 
 
+def _is_log(recording: Recording) -> bool:
+    """Whether a file is read as a log is: a table that states what each column is."""
+    tables = {f.format for f in recording.files} <= _TABLES
+    return tables and not recording.guessed
+
+
 def after_check(
     reports: Sequence[CheckReport], ship: Vessel, record: Mapping[str, Any]
 ) -> list[NextStep]:
@@ -154,8 +163,17 @@ def after_check(
         )
         if r.recording is not None and name not in r.recording
     ]
+    raw = any(r.recording is not None and not _is_log(r.recording) for r in reports)
     if not steps and lacking:
         steps.append(NextStep(lacking[0]))
+    elif not steps and raw:
+        target = "log.csv" if len(reports) == 1 else "imported"
+        steps.append(
+            NextStep(
+                "Read raw files into logs, which models are estimated on",
+                f"greybox import {logs} --vessel {vessel} --out {target}",
+            )
+        )
     elif not steps:
         steps.append(
             NextStep(

@@ -41,7 +41,7 @@ from greybox.trial.checks.signal_quality import (
 )
 from greybox.trial.checks.thruster_response import answer_findings
 from greybox.trial.checks.wind_convention import wind_findings
-from greybox.trial.raw_log import Recording, Signal
+from greybox.trial.raw_log import Recording, Signal, SourceFile
 from greybox.trial.steps import mend
 from greybox.vessel.toml import load_vessel
 
@@ -354,6 +354,11 @@ def test_what_comes_next_is_a_model_only_of_logs_that_have_a_heading():
     blind = report_of([], as_recording({n: c[n] for n in ("t", "u", "v", "r", "n")}))
     (step,) = after_check([whole], SHIP, {})
     assert step.command.startswith("greybox estimate LOG… ")
+    guessed = replace(whole.recording, guessed=frozenset({"psi"}))
+    bag = replace(whole.recording, files=(SourceFile("a.bag", "", "ROS bag"),))
+    for raw in (guessed, bag):
+        (step,) = after_check([whole, replace(whole, recording=raw)], SHIP, {})
+        assert step.command == "greybox import LOG… --vessel V --out imported"
     (step,) = after_check([whole, blind], SHIP, {})
     assert step.command == ""
     assert "'virtual' that holds the heading as psi" in step.purpose
