@@ -19,10 +19,10 @@ from experiment_design.criteria.cause_power import (
 from experiment_design.feasibility.checks import require_horizon
 from experiment_design.for_prediction import (
     RANDOM_SETTINGS,
-    command_ranges,
     described_plan,
     operating_envelope,
     random_motions,
+    ranges_of_ship,
     started_in,
     tightened_search,
 )
@@ -37,11 +37,14 @@ from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.diagnosis.causes import Context, known_causes
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.result import finite
+from greybox.diagnosis.ship import CURRENTS
 from greybox.diagnosis.thresholds import SIGNIFICANT
 from greybox.errors import UsageError, suggestion
 from greybox.files import read_json
 from greybox.model.model import ManoeuvringModel
 from greybox.numerics.threads import one_thread
+from greybox.vessel.actuation import with_actuators_of
+from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
@@ -116,6 +119,52 @@ def causes_left_open(diagnosis: Any, name: str = "diagnosis") -> AskedCauses:
     return AskedCauses({str(c.get("place") or c["id"]): c["parameters"] for c in found}, tried)
 
 
+# causes that a model holds in when its thrusters act, and in how they push
+_WHEN = ("thruster_lag", "input_delay", "rate_limit", "feedback_sampling")
+_HOW = ("thruster_gain", "quadratic_thrust", "angle_offset")
+
+
+def without_open_causes(
+    model: ManoeuvringModel, asked: AskedCauses, vessel: Vessel
+) -> tuple[ManoeuvringModel, tuple[str, ...]]:
+    """Return a model without what it holds of open causes, and notes.
+
+    A diagnosis that ends with several causes writes the model with the first of them, whose size
+    is an estimate from none: it can be tested again only beside a ship that does not have it.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+    asked : AskedCauses
+    vessel : Vessel
+        Whose thrusters act as they did before the diagnosis.
+    """
+    known = model.record.get("causes")
+    keys = [k for k in known if isinstance(k, str)] if isinstance(known, list | tuple) else []
+    ids = {k: k.partition(":")[0] for k in keys}
+    held = [k for k in keys if k in asked.estimates or ids[k] in asked.estimates]
+    before = with_actuators_of(model.vessel, vessel)
+    out = []
+    for key in held:
+        changed = model
+        if ids[key] in _WHEN:
+            acting = replace(model.vessel, actuation=before.actuation)
+            changed = replace(model, vessel=acting)
+        elif ids[key] in _HOW:
+            acting = replace(model.vessel, thrusters=before.thrusters)
+            changed = replace(model, vessel=acting)
+        elif ids[key] == "current" and model.disturbances:
+            kept = {n: v for n, v in model.disturbances.items() if n not in CURRENTS}
+            changed = replace(model, disturbances=kept, disturbance_covariance=np.zeros((0, 0)))
+        if changed is not model:
+            model = changed
+            out.append(key)
+    if not out:
+        return model, ()
+    said = f"the model holds {', '.join(out)}, which is open: the trial is planned without it"
+    return model, (said,)
+
+
 def open_causes(
     request: PreparedRequest, model: ManoeuvringModel, asked: AskedCauses
 ) -> tuple[tuple[OpenCause, ...], int, tuple[str, ...]]:
@@ -132,12 +181,13 @@ def open_causes(
     Raises
     ------
     UsageError
-        A name is none of this ship's causes or stands for several places, or none is left.
+        A name is none of this ship's causes or stands for several places, or none is left; or
+        the model is of a ship with other commands.
     """
     terms = {n for k, e in asked.estimates.items() for n in (*e, *k.partition(":")[2].split("+"))}
     own = [n for n in request.structure.parameters if n in terms]
     structure = request.structure.without(*own) if own else request.structure
-    used = command_ranges(model, {})
+    used = ranges_of_ship(request, model, {})
     steps = zip(request.schedule.commands, request.schedule.ramp, strict=True)
     context = Context(
         structure=structure,
@@ -248,7 +298,7 @@ class CauseDesign:
                     "parameters": {
                         c.hypothesis.parameters[i].name: {
                             "away_from_null": float(s),
-                            "unit": c.hypothesis.parameters[i].unit,
+                            "unit": _searched_unit(c.hypothesis.parameters[i]),
                             "estimated": c.estimated,
                         }
                         for i, s in zip(c.tested, c.size, strict=True)
@@ -318,13 +368,18 @@ class CauseDesign:
         return "\n".join([*lines, *[f"Note: {n}" for n in self.design.notes]])
 
 
+def _searched_unit(parameter: Parameter) -> str:
+    """Return the unit of the number that is searched: of a rate, the time of the whole way."""
+    return "s" if parameter.over else parameter.unit
+
+
 def _sizes(cause: OpenCause) -> str:
-    told = ", ".join(
-        f"{cause.hypothesis.parameters[i].name} "
-        f"{cause.hypothesis.parameters[i].null + s:.3g} {cause.hypothesis.parameters[i].unit}"
-        for i, s in zip(cause.tested, cause.size, strict=True)
-    )
-    return f"{told} ({'as estimated' if cause.estimated else 'a typical size'})"
+    told = []
+    for i, s in zip(cause.tested, cause.size, strict=True):
+        p = cause.hypothesis.parameters[i]
+        value, _ = p.told(p.null + s, 0.0)
+        told.append(f"{p.name} {value:.3g} {p.unit}")
+    return f"{', '.join(told)} ({'as estimated' if cause.estimated else 'a typical size'})"
 
 
 @one_thread()
@@ -405,7 +460,7 @@ def design_for_causes(
     design = described_plan(
         request, searches, keeping, kept_starts=int(kept_start), began=began,
         best_effort=best_effort,
-        certificate="a plan for causes has no bound to be measured against",
+        certificate="no bound is known on the power that any other trial could reach",
     )  # fmt: skip
 
     def reported(motion: Any) -> PowerReport | None:

@@ -264,6 +264,26 @@ def diagnosed_misfit(model: ManoeuvringModel) -> dict[str, float]:
     return {s: min(1.0, max(0.0, 1 - f / 100)) for s, f in known.items()}
 
 
+def ranges_of_ship(
+    request: PreparedRequest, model: ManoeuvringModel, given: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float]]:
+    """Return the range in which each command of the ship is used: see `command_ranges`.
+
+    Raises
+    ------
+    UsageError
+        The prior is of a ship with other commands.
+    """
+    ranges = command_ranges(model, given)
+    if lacking := [n for n in request.schedule.commands if n not in ranges]:
+        raise UsageError(
+            f"the prior is of '{model.vessel.name}', which has no {', '.join(lacking)} as "
+            f"'{request.vessel.name}' has: give a model of this ship, or the vessel file that the "
+            f"prior was estimated with."
+        )
+    return ranges
+
+
 def operating_envelope(
     request: PreparedRequest, model: ManoeuvringModel, given: Mapping[str, tuple[float, float]]
 ) -> tuple[Envelope, str]:
@@ -287,12 +307,7 @@ def operating_envelope(
         build_predictor(named, "basic", tuple((s, (1, -1)) for s in request.structure.states)),
         structure=request.structure,
     )
-    ranges = command_ranges(model, given)
-    if lacking := [n for n in request.schedule.commands if n not in ranges]:
-        raise UsageError(
-            f"the prior is of '{model.vessel.name}', which has no {', '.join(lacking)} as "
-            f"'{request.vessel.name}' has: give a model of this ship, or leave --vessel out."
-        )
+    ranges = ranges_of_ship(request, model, given)
     rollout = build_problem(request).scenarios[0].rollout
     found = build_envelope(
         rollout, predictor, request.noise, request.schedule, ranges, speeds, misfit, request.seed
@@ -358,7 +373,7 @@ def design_for_prediction(
     searches, keeping = tightened_search(asked, lambda r: _campaign(r, found, before, workers))
     design = described_plan(
         asked, searches, keeping, kept_starts=kept_starts, began=began, best_effort=best_effort,
-        certificate="a plan for prediction has no bound to be measured against",
+        certificate="no bound is known on how well a model of any other trial could predict",
     )  # fmt: skip
     usual = usual_beginnings(found, asked.schedule.holds, asked.hold).shape[1]
     design = replace(design, parts=_parts(asked, design.parts, usual))
@@ -424,15 +439,19 @@ def started_in(request: PreparedRequest, envelope: Envelope, kept: int) -> Prepa
 
 
 def _courses(envelope: Envelope) -> Iterator[tuple[Array, Array]]:
-    """Yield states with heading (nx + 1,) on courses, and their commands (nc,), fastest first."""
+    """Yield states with heading (nx + 1,) on courses, and their commands (nc,).
+
+    Those that steer nothing come first, of either kind the fastest.
+    """
     yield envelope.rollout.start, envelope.begun
-    courses, rollout = envelope.settings[envelope.straight], envelope.rollout
+    rollout = envelope.rollout
     samples = round(STEADY_SECONDS / rollout.sample_time)
-    motion = rollout.run(np.repeat(courses[:, None], samples, axis=1))
-    steady = motion.state[:, -1, : rollout.nx]
-    for i in np.argsort(-steady[:, 0], kind="stable"):
-        if motion.stable[i]:
-            yield np.append(steady[i], 0.0), courses[i]
+    for courses in (envelope.ahead, envelope.settings[envelope.straight]):
+        motion = rollout.run(np.repeat(courses[:, None], samples, axis=1))
+        steady = motion.state[:, -1, : rollout.nx]
+        for i in np.argsort(-steady[:, 0], kind="stable"):
+            if motion.stable[i]:
+                yield np.append(steady[i], 0.0), courses[i]
 
 
 def random_motions(

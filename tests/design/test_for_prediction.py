@@ -14,6 +14,7 @@ from experiment_design.constraints.limits import Circle, TrialLimits
 from experiment_design.design import CLOSEST
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
+from experiment_design.for_causes import AskedCauses, open_causes
 from experiment_design.for_prediction import (
     command_ranges,
     design_for_prediction,
@@ -395,6 +396,8 @@ def test_a_prior_of_another_ship_is_refused() -> None:
     other = replace(model, vessel=replace(model.vessel, name="tug", thrusters=thrusters))
     with pytest.raises(UsageError, match="'tug', which has no n as '"):
         design_for_prediction(request, other)
+    with pytest.raises(UsageError, match="'tug', which has no n as '"):
+        open_causes(request, other, AskedCauses({"current": {}}, named=True))
 
 
 @pytest.fixture(scope="module")
