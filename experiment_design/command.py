@@ -584,6 +584,7 @@ def _run_for_causes(
         causes_left_open,
         design_for_causes,
         read_diagnosis,
+        without_open_causes,
     )
     from experiment_design.prepare import both_sides, prepare_request
     from greybox.errors import UsageError
@@ -600,6 +601,7 @@ def _run_for_causes(
             f"greybox diagnose: give --diagnosis D, the JSON of greybox diagnose --json D, or name "
             f"them, such as --causes current heading_bias."
         )
+    model, held = without_open_causes(model, causes, vessel)
     request = prepare_request(
         model, both_sides(_asked(options, model), model), vessel, best_effort=options.best_effort
     )
@@ -612,7 +614,8 @@ def _run_for_causes(
         best_effort=options.best_effort,
         workers=options.workers,
     )
-    _deliver(options, found.design, found, request.of_both_sides, {}, found.headline())
+    notes = (*held, *request.of_both_sides)
+    _deliver(options, found.design, found, notes, {}, found.headline())
 
 
 def _range(text: str, vessel: Any) -> tuple[str, tuple[float, float]]:

@@ -16,7 +16,7 @@ from experiment_design.optimise.search import draw_two_level
 from experiment_design.output.result import Design
 from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.request import CandidateModel, PreparedRequest, build_problem
-from greybox.errors import UsageError
+from greybox.errors import InfeasibleError, UsageError
 from greybox.notebook import DisplayMixin, items, number, sparkline, table
 
 Array = NDArray[np.float64]
@@ -185,6 +185,8 @@ def design_between(
     UsageError
         The two predict the same motion or have other states, or what is asked does not go with
         two models.
+    InfeasibleError
+        The limits cannot be kept, or the run of one leaves every bound at the slightest change.
 
     References
     ----------
@@ -217,7 +219,7 @@ def design_between(
         )
         contrast = build_problem(asked).contrast
         assert isinstance(contrast, Contrast)
-        steps = _steps(contrast.pairs[0], design.commands[0])
+        steps = _steps(contrast.pairs[0], design.commands[0], names)
         found = _judge(design, contrast.pairs[0], steps, names)
         if best is None or found.telling > best.telling:
             best = found
@@ -251,12 +253,27 @@ def _free(model: Any) -> list[int]:
     return [*range(size), *[size + i for i in range(model.d.size) if model.d[i] != 0]]
 
 
-def _steps(pair: Pair, commands: Array) -> list[tuple[Array, Array, Array]]:
-    """Return innovations, sensitivities and the fitted step of each model's filter."""
+def _steps(pair: Pair, commands: Array, names: tuple[str, str]) -> list[tuple[Array, Array, Array]]:
+    """Return innovations, sensitivities and the fitted step of each model's filter.
+
+    Raises
+    ------
+    InfeasibleError
+        A run leaves every bound as soon as one parameter changes.
+    """
     out = []
     seen = pair.innovations(commands)
     for which, model in enumerate((pair.first, pair.second)):
         slope = pair.sensitivities(commands, which, _free(model))
+        lost = ~np.isfinite(slope).all(axis=0)
+        if lost.any():
+            known = (*model.structure.parameters, *model.structure.disturbances)
+            raise InfeasibleError(
+                f"the run of {names[which]} leaves every bound when {known[int(lost.argmax())]} "
+                f"changes by a hundred-thousandth of itself, so nothing tells how well it could "
+                f"imitate {names[1 - which]}: shorten the trial (--duration), or estimate both on "
+                f"longer logs."
+            )
         size = np.linalg.norm(slope, axis=0)
         size[size == 0] = 1.0
         step = -np.linalg.lstsq(slope / size, seen[which], rcond=1e-8)[0] / size

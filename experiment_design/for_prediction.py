@@ -446,7 +446,8 @@ def _courses(envelope: Envelope) -> Iterator[tuple[Array, Array]]:
     yield envelope.rollout.start, envelope.begun
     rollout = envelope.rollout
     samples = round(STEADY_SECONDS / rollout.sample_time)
-    for courses in (envelope.ahead, envelope.settings[envelope.straight]):
+    kinds = envelope.ahead, envelope.settings[envelope.straight]
+    for courses in (k for k in kinds if len(k)):
         motion = rollout.run(np.repeat(courses[:, None], samples, axis=1))
         steady = motion.state[:, -1, : rollout.nx]
         for i in np.argsort(-steady[:, 0], kind="stable"):

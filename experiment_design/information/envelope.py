@@ -16,7 +16,7 @@ is tr W C: small where the trial moves as the ship will be used, much and long.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -32,11 +32,14 @@ from greybox.model.run.step import StepModel
 from greybox.numerics.linalg import scaled, sizes, trace_with_inverse
 from greybox.numerics.recursion import propagate
 from greybox.numerics.vectorised import Vectorised
+from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
 # constant commands that are tried, and after how many time scales the motion is steady
 _TRIED, _SETTLING = 1000, 60.0
+# speeds that are tried with nothing steered
+_AHEAD = 20
 # sequences that stand for the envelope, their length, and after how long a free run begins anew
 _SEQUENCES, _LENGTH, _RUN = 40, 40.0, 20.0
 # how long a command is held in them, in time scales: half a length to six lengths sailed
@@ -66,7 +69,11 @@ class Envelope:
     rollout : Rollout
         The prior model, from a steady motion of the envelope.
     begun : ndarray
-        (nc,) constant commands that hold the ship in that motion.
+        (nc,) constant commands that hold the ship in that motion: the first of `ahead`, or else the
+        fastest of those that hold a course.
+    ahead : ndarray
+        (k, nc) constant commands that steer nothing and hold a course, fastest first; none where
+        one command alone steers.
     predictor : Predictor
         Whose columns are the primary terms.
     variance : ndarray
@@ -93,6 +100,7 @@ class Envelope:
 
     rollout: Rollout
     begun: Array
+    ahead: Array
     predictor: Predictor
     variance: Array
     lower: Array
@@ -220,6 +228,17 @@ class Envelope:
         dt = self.rollout.sample_time
         return _drawn(self.settings, self.lasting / dt, self.straight, samples,
                       self.time_scale / dt, rng)  # fmt: skip
+
+
+def _ahead(vessel: Vessel, columns: Sequence[str], lower: Array, upper: Array) -> Array:
+    """Return commands (k, nc) that steer nothing, speeds at the same share of their ranges.
+
+    There are none where one command alone steers: two may hold a course against each other.
+    """
+    tunnels = {t.speed for t in vessel.thrusters if t.type == "tunnel"}
+    steers = np.array([c in vessel.angle_commands or c in tunnels for c in columns])
+    share = np.linspace(1.0, 0.0, _AHEAD if steers.sum() > 1 else 0)[:, None]
+    return np.where(steers, np.clip(0.0, lower, upper), lower + (upper - lower) * share)
 
 
 def _within(motion: Motion, speeds: tuple[float, float]) -> NDArray[np.bool_]:
@@ -364,10 +383,20 @@ def build_envelope(
         # where a crew would begin: on a course, at speed
         course = _straight(steady[held])
         best = course[int(steady[held][course, 0].argmax())]
-        begun = tried[held][best]
+        begun, start, ahead = tried[held][best], steady[held][best], tried[:0]
+        plain = _ahead(rollout.vessel, schedule.commands, lower, upper)
+        if len(plain):
+            settled = rollout.run(np.repeat(plain[:, None], settled.tau.shape[1], axis=1))
+            x, size = settled.state[:, -1, :nx], steady[held].std(axis=0)
+            # as straight as the fastest one that was drawn, and no faster
+            good = _within(settled, shown)[:, -1] & (x[:, 0] <= start[0])
+            good &= (np.abs(x[:, 1:]) <= np.abs(start[1:]) + 0.1 * size[1:]).all(axis=1)
+            ahead = plain[good]
+            if good.any():
+                begun, start = ahead[0], x[good][0]
         rollout = Rollout(
             rollout.vessel, rollout.structure, rollout.theta, rollout.d,
-            np.append(steady[held][best], 0.0), dt, rollout.integrator,
+            np.append(start, 0.0), dt, rollout.integrator,
         )  # fmt: skip
         motion = rollout.run(np.repeat(tried[:, None], int(HOLDS[1] * scale / dt), axis=1))
         # until when a setting keeps the ship within the envelope, at most the longest hold
@@ -412,8 +441,8 @@ def build_envelope(
     variance = np.asarray(noise.measurement, float) ** 2 + lasting * by_step
     precision = np.concatenate([np.zeros(len(predictor.columns)), 1 / tau])
     return Envelope(
-        rollout, begun, predictor, variance, lower, upper, shown, settings, kept * dt, reached,
-        straight, scale, share, spread, features, moments, precision,
+        rollout, begun, ahead, predictor, variance, lower, upper, shown, settings, kept * dt,
+        reached, straight, scale, share, spread, features, moments, precision,
     )  # fmt: skip
 
 

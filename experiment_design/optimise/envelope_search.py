@@ -79,12 +79,11 @@ def usual_manoeuvres(envelope: Envelope, holds: int, hold: float) -> Array:
     hold : float
         [s]
     """
-    settings, reached = envelope.settings, envelope.reached
     right, left = _to_both_sides(envelope, _TURN, fast=True)
     slow_right, slow_left = _to_both_sides(envelope, _TURN, fast=False)
-    course = settings[envelope.straight[int(reached[envelope.straight, 0].argmax())]]
     order = np.array([
-        course, right, left, right, left, slow_left, slow_right, slow_left, slow_right, left,
+        envelope.begun, right, left, right, left, slow_left, slow_right, slow_left, slow_right,
+        left,
     ])  # fmt: skip
     # where it is too short for all of it, every leg gets its share
     leg = max(1, min(_leg(envelope, hold), holds // len(order)))

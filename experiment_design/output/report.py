@@ -95,7 +95,7 @@ def saving(design: Design) -> str:
     """Return how much time the plan saves, and how near it is to the best possible."""
     r = design.request
     whole = r.duration * r.trials
-    gain = design.efficiency_vs_random
+    gain, by = design.gain_vs_random, design.by_criterion
     if gain is None:
         first = "No random two-level sequence keeps the limits, so there is none to beat"
     elif gain > 1:
@@ -103,12 +103,12 @@ def saving(design: Design) -> str:
             f"This plan saves {(gain - 1) * whole:.0f} s of trial: the best of "
             f"{min(design.random_kept, REFERENCE)} random two-level sequences would need "
             f"{gain * whole:.0f} s for the precision that it reaches in {whole:.0f} s "
-            f"({gain:.2f} times the information)"
+            f"({gain:.2f} times the information{by})"
         )
     else:
         first = (
             f"This plan tells {gain:.2f} times what the best of "
-            f"{min(design.random_kept, REFERENCE)} random two-level sequences tells"
+            f"{min(design.random_kept, REFERENCE)} random two-level sequences tells{by}"
         )
     said = design.certificate.sentence().rstrip(".")
     led = ""

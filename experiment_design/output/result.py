@@ -264,7 +264,7 @@ class Design(DisplayMixin):
                     "name": a.name,
                     "tried": a.tried,
                     "kept": a.kept,
-                    "efficiency_of_design": self._gain(a),
+                    "efficiency_of_design": self._gain(a.value),
                 }
                 for a in self.alternatives
             ],
@@ -277,11 +277,24 @@ class Design(DisplayMixin):
             "notes": list(self.notes),
         }
 
-    def _gain(self, alternative: Alternative) -> float | None:
-        if not np.isfinite(alternative.value):
+    def _gain(self, value: float) -> float | None:
+        if not np.isfinite(value):
             return None
         size = CRITERIA[self.request.criterion].shared_by(len(self.names))
-        return float(np.exp((self.criterion_value - alternative.value) / size))
+        return float(np.exp((self.criterion_value - value) / size))
+
+    @property
+    def gain_vs_random(self) -> float | None:
+        """`efficiency_vs_random`, by the criterion that was designed for where it is not D."""
+        if self.efficiency_vs_random is None or CRITERIA[self.request.criterion].determinant:
+            return self.efficiency_vs_random
+        return self._gain(self.random_value)
+
+    @property
+    def by_criterion(self) -> str:
+        """Which information `gain_vs_random` compares, for a sentence; empty for that of D."""
+        criterion = CRITERIA[self.request.criterion]
+        return "" if criterion.determinant else f" by criterion {criterion.name}"
 
     def _behind(self) -> str:
         return f" behind a lead-in of {self.lead_in_s:g} s" if self.lead_in_s else ""
@@ -302,11 +315,11 @@ class Design(DisplayMixin):
             f"{self.status}",
             *(["planned without an estimated model, from main dimensions"] if r.untried else []),
         ]
-        if self.efficiency_vs_random is not None:
+        if (gain := self.gain_vs_random) is not None:
             lines.append(
-                f"{self.efficiency_vs_random:.2f} times the information of the best of "
+                f"{gain:.2f} times the information{self.by_criterion} of the best of "
                 f"{min(self.random_kept, REFERENCE)} random two-level sequences, which would need "
-                f"{self.efficiency_vs_random * r.duration * r.trials:.0f} s for the same precision"
+                f"{gain * r.duration * r.trials:.0f} s for the same precision"
             )
         else:
             lines.append("no random two-level sequence keeps the limits, so there is none to beat")
@@ -325,7 +338,7 @@ class Design(DisplayMixin):
         if self.alternatives:
             lines += ["", f"{'instead of':<28}{'tried':>7}{'kept':>7}  this plan gives"]
             for a in self.alternatives:
-                gain = self._gain(a)
+                gain = self._gain(a.value)
                 shown = "-" if gain is None else f"{gain:.2f} times"
                 if gain is None or gain > 1000:
                     shown = "tells nothing"

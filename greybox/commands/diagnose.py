@@ -219,7 +219,10 @@ def _save(diagnosis: Diagnosis, path: str, record: dict[str, Any]) -> list[str]:
         replace(model, record={**model.record, **told}).save(other)
         written.append(str(other))
     replace(diagnosis.model, record={**diagnosis.model.record, **told}).save(target)
-    return [
-        *written,
-        path if diagnosis.causes else f"{path}: the model without a cause, as none stands",
-    ]
+    if diagnosis.causes:
+        return [*written, path]
+    held = ", ".join(diagnosis.model.record.get("causes", ()))
+    said = "the model without a cause, as none stands"
+    if held:
+        said = f"the model with {held}, one of those that cannot be told apart"
+    return [*written, f"{path}: {said}"]

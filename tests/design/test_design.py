@@ -24,6 +24,7 @@ from experiment_design.excitation.inputs import multisines, prbs, random_two_lev
 from experiment_design.feasibility.checks import missed_targets
 from experiment_design.optimise.campaign import Found, std_of
 from experiment_design.optimise.search import assess, best_random, exchange, to_unit
+from experiment_design.output.report import saving
 from experiment_design.request.expressions import gradient_of
 from experiment_design.request.regimes import parse_regime, spell_regime
 from experiment_design.request.request import build_problem
@@ -97,6 +98,15 @@ def test_a_design_shows_itself(basic):
         assert key in data
     assert set(data["predicted_std"]) == set(basic.names)
     assert data["margins"]["u"] >= 0.5
+
+
+def test_what_a_plan_gains_is_told_by_its_own_criterion(basic):
+    other = replace(basic, request=replace(basic.request, criterion="A"), random_value=1.0,
+                    criterion_value=1.5)  # fmt: skip
+    said = f"{np.exp(0.5):.2f} times the information by criterion A of the best of 200"
+    assert said in other.summary()
+    assert f"({np.exp(0.5):.2f} times the information by criterion A)" in saving(other)
+    assert other.to_dict()["efficiency_vs_random"] == basic.efficiency_vs_random
 
 
 @pytest.mark.long

@@ -11,10 +11,10 @@ from designs import make_request, thesis_model
 
 from experiment_design import CandidateModel, design_between, design_trial
 from experiment_design.criteria.t_optimality import Pair
-from experiment_design.discriminate import Discrimination, probability_right
+from experiment_design.discriminate import Discrimination, _steps, probability_right
 from experiment_design.request.request import build_problem
 from greybox.commands.main import main
-from greybox.errors import UsageError
+from greybox.errors import InfeasibleError, UsageError
 from greybox.model.run.simulation import simulate
 from greybox.vessel.toml import load_vessel
 
@@ -195,3 +195,20 @@ def test_explanations_of_other_states(tmp_path, capsys):
         assert "states u, v, r" in said or "and a u, v, r" in said
         assert said.count("\n") == 1
     assert not out.exists()
+
+
+def test_a_run_at_the_edge_of_its_bounds_is_refused():
+    request = make_request(duration=60.0)
+    problem = build_problem(replace(request, contrasts=((_first(request), _rival(request)),)))
+    pair = problem.contrast.pairs[0]
+    commands = _commands(problem)
+    slopes = pair.sensitivities
+
+    def lost(commands, which, positions):
+        found = slopes(commands, which, positions)
+        found[:, 2] = np.nan
+        return found
+
+    pair.sensitivities = lost
+    with pytest.raises(InfeasibleError, match="run of a leaves every bound when Xuu changes"):
+        _steps(pair, commands, ("a", "b"))

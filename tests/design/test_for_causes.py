@@ -14,9 +14,11 @@ from experiment_design.constraints.limits import TrialLimits
 from experiment_design.criteria.cause_power import WANTED, CausePower
 from experiment_design.for_causes import (
     AskedCauses,
+    _sizes,
     causes_left_open,
     design_for_causes,
     open_causes,
+    without_open_causes,
 )
 from experiment_design.request.request import build_problem
 from greybox.commands.main import main
@@ -186,6 +188,37 @@ def test_causes_that_cannot_be_at_work_are_named(model) -> None:
         design_for_causes(two, model, AskedCauses({"current": {}}))
 
 
+def test_an_open_cause_that_the_model_holds_is_taken_out_of_it(model) -> None:
+    # as a confused diagnosis writes the model: with the first cause, sizes as from none
+    late = replace(SHIP.actuation, lag=6.0, lag_on="speed", rate_limit=0.2, rate_on="n")
+    strong = tuple(replace(t, gain=0.8) for t in SHIP.thrusters)
+    acting = replace(SHIP, actuation=late, thrusters=strong)
+    here = {"current_north": (0.3, 0.01), "current_east": (0.1, 0.01)}
+    held = ["thruster_lag:speed", "current", "thruster_gain:n:alpha1", "rate_limit:n"]
+    holding = replace(model, vessel=acting, disturbances=here, record={"causes": held})
+    estimates = {"thruster_lag:speed": {"lag": {"value": 6.0}}, "current": CURRENT}
+    left, notes = without_open_causes(holding, AskedCauses(estimates), SHIP)
+    assert left.vessel.actuation == SHIP.actuation
+    assert not left.d[:2].any()
+    assert left.vessel.thrusters[0].gain == 0.8
+    said = "the model holds thruster_lag:speed, current, which is open: the trial is planned"
+    assert notes[0].startswith(said)
+    causes, *_ = open_causes(request_of(), left, AskedCauses(estimates))
+    assert [c.size[0] for c in causes] == [6.0, 0.009]
+    again, notes = without_open_causes(holding, AskedCauses({"thruster_gain": {}}), SHIP)
+    assert again.vessel.thrusters == SHIP.thrusters
+    assert again.vessel.actuation == late
+    assert without_open_causes(model, AskedCauses(estimates), SHIP) == (model, ())
+
+
+def test_a_rate_is_told_in_its_unit_and_searched_as_a_time(model) -> None:
+    entry = {"rate_limit:n": {"rate_n": {"value": 0.2}}}
+    (cause,), *_ = open_causes(request_of(), model, AskedCauses(entry, named=True))
+    way = cause.hypothesis.parameters[0].over
+    assert cause.size[0] == pytest.approx(way / 0.2)
+    assert _sizes(cause) == "rate_n 0.2 n/s (as estimated)"
+
+
 @pytest.fixture(scope="module")
 def found(model):
     request = request_of(effort=0.6)
@@ -202,6 +235,7 @@ def test_a_plan_tells_more_than_random_and_usual_trials(found) -> None:
     ratio = found.random.detectable_share.max() / worst
     assert told["efficiency_vs_random"] == pytest.approx(ratio**2)
     assert told["efficiency_lower_bound"] is None
+    assert told["certificate"]["reason"].startswith("no bound is known on the power")
     assert "noncentrality" in told["efficiency_of"]
     json.dumps(told["causes"], allow_nan=False)
     assert told["for"] == "causes"

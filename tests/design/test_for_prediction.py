@@ -19,6 +19,7 @@ from experiment_design.for_prediction import (
     command_ranges,
     design_for_prediction,
     diagnosed_misfit,
+    operating_envelope,
     prior_misfit,
     started_in,
 )
@@ -30,12 +31,16 @@ from experiment_design.optimise.envelope_search import (
     usual_manoeuvres,
 )
 from experiment_design.output.next_steps import after_design
-from experiment_design.request.request import OutOfReach, build_problem
+from experiment_design.prepare import both_sides, prepare_request
+from experiment_design.request.request import DesignRequest, OutOfReach, build_problem
 from greybox.commands.main import main
 from greybox.errors import InfeasibleError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
+from greybox.model.semi_empirical import semi_empirical_model
 from greybox.study.chapter6 import TRUE
+from greybox.vessel.thrust import ThrustLaw
+from greybox.vessel.vessel import Limits, Thruster, Vessel
 
 BOTH = ((("u", 1),),)
 
@@ -467,6 +472,27 @@ def test_a_trial_starts_on_the_fastest_course_that_its_cap_allows(envelope) -> N
 
 
 @pytest.mark.usefixtures("hasty")
+def test_a_course_is_begun_with_no_rudder_held_against_another() -> None:
+    stern = Thruster(
+        "propeller_rudder", -27.0, -3.0, "n1", rudder="d1", speed_limits=Limits(0.0, 5.0),
+        rudder_limits=Limits(-0.6, 0.6), thrust=ThrustLaw("quadratic"),
+    )  # fmt: skip
+    twin = Vessel(
+        "twin", 60.0, (stern, replace(stern, y=3.0, speed="n2", rudder="d2")), beam=11.0,
+        mass=1.2e6, service_speed=7.0, sensors={"u_std": 0.02, "v_std": 0.02, "r_std": 0.001},
+    )  # fmt: skip
+    model = semi_empirical_model(twin)
+    asked = DesignRequest(duration=300.0, predictor="basic")
+    request = prepare_request(model, both_sides(asked, model), twin)
+    envelope, _ = operating_envelope(request, model, {})
+    first, rudders = envelope.begun[::2], envelope.begun[1::2]
+    assert first[0] == first[1]
+    assert not rudders.any()
+    assert not envelope.rollout.start[1:].any()
+    begun = started_in(replace(request, misfit=envelope.misled), envelope, 0)
+    assert begun.start_commands[0][1] == begun.start_commands[0][3] == 0
+
+
 def test_the_closest_plan_where_no_other_is_found(model) -> None:
     room = TrialLimits(margins={"u": 0.2}, area=Circle(0.0, 0.0, 8.0))
     request = request_of(duration=60.0, effort=0.01, limits=room)
