@@ -18,6 +18,7 @@ from greybox.diagnosis.evidence.remainder import (
 from greybox.diagnosis.evidence.standing import Standing, _own_arguments, standing
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.search import FIRST, Search, _stands, weighed
+from greybox.diagnosis.thresholds import PROVEN, SAME
 from greybox.study.blind import draw
 from greybox.vessel.vessel import Thruster, Vessel
 
@@ -27,31 +28,33 @@ def proof(gain: float, p: float) -> Proof:
 
 
 @pytest.mark.parametrize(
-    ("beyond", "share", "half", "clear", "told", "stands"),
+    ("beyond", "share", "half", "clear", "told", "known", "stands"),
     [
-        ((50.0, 1e-9), None, 1.0, 1e-9, 1e-9, True),
+        ((50.0, 1e-9), None, 1.0, 1e-9, 1e-9, PROVEN, True),
         # no better than the force without a name, which is no function of what it is
-        ((3.0, 0.2), None, 1.0, 1e-9, 1e-9, False),
+        ((3.0, 0.2), None, 1.0, 1e-9, 1e-9, PROVEN, False),
         # as good as a force of its own arguments
-        ((-4.0, 0.8), 0.9, 1e-4, 1e-9, 1e-9, True),
-        ((-4.0, 0.8), 0.7, 1e-4, 1e-9, 1e-9, False),
-        ((-4.0, 0.8), 0.9, 0.2, 1e-9, 1e-9, False),
+        ((-4.0, 0.8), 0.9, 1e-4, 1e-9, 1e-9, SAME, True),
+        ((-4.0, 0.8), 0.7, 1e-4, 1e-9, 1e-9, SAME, False),
+        ((-4.0, 0.8), 0.9, 0.2, 1e-9, 1e-9, SAME, False),
         # its value may be null once that force is there
-        ((50.0, 1e-9), 0.9, 1e-4, 0.3, 1e-9, False),
+        ((50.0, 1e-9), 0.9, 1e-4, 0.3, 1e-9, SAME, False),
         # it moves by less than it is, or by more
-        ((50.0, 1e-9), 0.9, 1e-4, 1e-9, 0.1, True),
-        ((50.0, 1e-9), 0.9, 1e-4, 1e-9, 0.4, False),
-        # what heading, time or earlier commands do must be surer
-        ((50.0, 1e-9), None, 1.0, 1e-9, 0.04, True),
-        ((50.0, 1e-9), None, 1.0, 1e-9, 0.1, False),
+        ((50.0, 1e-9), 0.9, 1e-4, 1e-9, 0.1, SAME, True),
+        ((50.0, 1e-9), 0.9, 1e-4, 1e-9, 0.4, SAME, False),
+        # what says that a log is wrong, or heading, time or earlier commands do, must be surer
+        ((50.0, 1e-9), 0.9, 1e-4, 1e-9, 0.04, PROVEN, True),
+        ((50.0, 1e-9), 0.9, 1e-4, 1e-9, 0.1, PROVEN, False),
+        ((50.0, 1e-9), None, 1.0, 1e-9, 0.04, PROVEN, True),
+        ((50.0, 1e-9), None, 1.0, 1e-9, 0.1, PROVEN, False),
         # where it holds the run within bounds, nothing else speaks for it, and many causes would:
         # 20 were tried
-        ((np.inf, 0.0), None, 1.0, 1e-9, 4e-4, True),
-        ((np.inf, 0.0), None, 1.0, 1e-9, 6e-4, False),
+        ((np.inf, 0.0), None, 1.0, 1e-9, 4e-4, PROVEN, True),
+        ((np.inf, 0.0), None, 1.0, 1e-9, 6e-4, PROVEN, False),
     ],
 )
-def test_what_makes_a_cause_stand(beyond, share, half, clear, told, stands) -> None:
-    found = Standing(proof(*beyond), share, half, np.zeros(1), clear, told, tried=20)
+def test_what_makes_a_cause_stand(beyond, share, half, clear, told, known, stands) -> None:
+    found = Standing(proof(*beyond), share, half, np.zeros(1), clear, told, known=known, tried=20)
     assert found.stands is stands
 
 

@@ -62,6 +62,8 @@ class Standing:
         That of the surest of the numbers with its movement counted as a standard error.
     level : float
         Significance that a gain on held-out logs must have.
+    known : float
+        Significance that its surest number must have.
     tried : int
         Causes that were scored, of which this is one, each as often as a moment was sought for it.
     sought : bool
@@ -75,6 +77,7 @@ class Standing:
     clear: float
     told: float
     level: float = PROVEN
+    known: float = PROVEN
     tried: int = 1
     sought: bool = False
 
@@ -92,8 +95,7 @@ class Standing:
             # many a cause keeps a run within bounds, and many a moment follows a misfit: its number
             # alone speaks for it, and was the best of all that were tried
             return self.tried * self.told < SIGNIFICANT
-        # what heading, time or earlier commands do has no share of such a force to show for it
-        return self.told < (PROVEN if self.share is None else SAME)
+        return self.told < self.known
 
 
 def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequence[Pair],
@@ -118,7 +120,7 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
     if any(p.held_fit.escaped or p.fit.escaped for p in (*pairs, *without)):
         better = not any(p.held_fit.escaped for p in pairs)
         proof = proof_of(np.array([np.inf if better else -np.inf]))
-        return Standing(proof, None, 1.0, moved, clear, told, level, tried, sought)
+        return Standing(proof, None, 1.0, moved, clear, told, level, PROVEN, tried, sought)
     use = _own_arguments(problem, hypothesis)
     for pair in without:
         fit_generic_forces(pair, [MOTION_AND_COMMANDS, *([] if use is None else [use])])
@@ -133,7 +135,10 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
         gained, could = plain - own, plain - generic
         share = float(gained.sum() / could.sum()) if could.sum() > 0 else np.inf
         half = proof_of(gained - LEAST_SHARE * could).p_value
-    return Standing(beyond, share, half, moved, clear, told, level, tried, sought)
+    # every ship has such terms; that a log or the vessel file is wrong, or what heading, time and
+    # earlier commands do, must be surer
+    known = SAME if hypothesis.apply is None and share is not None else PROVEN
+    return Standing(beyond, share, half, moved, clear, told, level, known, tried, sought)
 
 
 def level_of(fit: Fit) -> float:
