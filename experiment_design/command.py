@@ -658,7 +658,7 @@ def _run_between(
     asked = _asked(options, model)
     request, _ = _prepared(options, model, asked, vessel, sailed)
     notes = request.notes
-    if options.model not in (None, options.between[0]):
+    if options.model not in (None, *options.between):
         notes = (
             f"--between begins from its first model, {options.between[0]}, and {options.model} "
             f"takes no part",

@@ -199,9 +199,11 @@ def test_sea_rooms_that_are_none(folder, capsys, text, message):
 @pytest.mark.usefixtures("hasty")
 def test_between(folder, capsys):
     pair = [str(folder / "model.json"), str(folder / "other.json")]
-    status, plan = run(folder, "--duration", "100", "--between", *pair, "--json", "-")
+    given = ("--duration", "100", "--between", *pair, "--model", pair[1], "--json", "-")
+    status, plan = run(folder, *given)
     assert status == 0
     data = json.loads(capsys.readouterr().out)
+    assert not any("takes no part" in note for note in data["notes"])
     schema("design-1", "experiment_design").validate(data)
     assert data["discrimination"]["between"] == ["model", "other"]
     assert plan.exists()
