@@ -317,12 +317,15 @@ def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str, kept:
 def _next(
     verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]], anew: bool
 ) -> list[str]:
-    out = [
-        f"design a trial that tells {' from '.join(ids)}: greybox design --vessel V "
-        f"--between {' '.join(f'MODEL.{file_word(i)}.json' for i in ids[:2])} --duration 900 "
-        f"--out plan.csv"
-        for ids in ([c.hypothesis.id for c in pair] for pair in groups)
-    ]
+    out = []
+    for ids in ([c.hypothesis.id for c in pair] for pair in groups):
+        told = "--model MODEL --for causes"
+        if len(ids) == 2:
+            told = f"--between {' '.join(f'MODEL.{file_word(i)}.json' for i in ids)}"
+        out.append(
+            f"design a trial that tells {' from '.join(ids)}: greybox design --vessel V {told} "
+            f"--duration 900 --out plan.csv"
+        )
     if anew:
         out.append(
             "estimate the model's coefficients from these logs: greybox estimate LOGS --vessel V "

@@ -100,9 +100,10 @@ def _groups(diagnosis: Diagnosis) -> Iterator[str]:
     """Yield how the members of confused groups show themselves, where a trial must look."""
     known = known_causes()
     for group in diagnosis.groups:
+        option = "--between" if len(group) == 2 else "--for causes"
         yield (
             f"These logs cannot tell {' from '.join(group)}. A trial in which their effects "
-            f"differ most tells them apart; greybox design --between plans it."
+            f"differ most tells them apart; greybox design {option} plans it."
         )
         for member in group:
             cause = known.get(member.partition(":")[0])

@@ -19,6 +19,8 @@ from virtual import recorded, virtual_log, write_csv
 
 from greybox.commands.diagnose import _with_files
 from greybox.commands.main import main
+from greybox.diagnosis.result import DiagnosisVerdict
+from greybox.diagnosis.ruling import _next
 from greybox.report.next_steps import after_comparison
 from greybox.trial.log import make_log
 from greybox.vessel.toml import load_vessel
@@ -314,6 +316,14 @@ def test_columns_in_another_unit_are_told_by_every_command_that_reads_logs(tmp_p
             mend = f'"{name}" = {{ name = "{name}", unit = "{unit}" }}'
             assert mend in said, (command[0], mend)
             assert any(mend in line for line in found)
+
+
+def test_more_than_two_causes_are_told_apart_by_one_trial():
+    named = [SimpleNamespace(hypothesis=SimpleNamespace(id=i)) for i in ("current", "wind", "sign")]
+    pair, whole = (_next(DiagnosisVerdict.CONFUSED, [g], False) for g in (named[:2], named))
+    assert "--between MODEL.current.json MODEL.wind.json " in pair[0]
+    assert "current from wind from sign: " in whole[0]
+    assert "--model MODEL --for causes " in whole[0]
 
 
 def test_next_steps_name_the_files_of_the_user():
