@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets, write_json
     from greybox.report.next_steps import after_check
     from greybox.trial.checks.check import check_files, require_each_once
-    from greybox.trial.checks.finding import shared_findings, shared_notes
+    from greybox.trial.checks.finding import shared_findings, shared_remarks
     from greybox.trial.log_files import find_logs
     from greybox.trial.repair import apply_repairs
     from greybox.trial.trial_summary import Contents, describe_recording
@@ -113,11 +113,11 @@ def run(options: argparse.Namespace) -> None:
         for finding in shared:
             say(f"{len(finding.logs)} of {len(reports)} logs: {', '.join(finding.logs)}")
             say(indent(finding.summary(), "  "))
-        notes = shared_notes(reports)
-        for note in notes:
-            say(f"note on all {len(reports)} logs: {note}")
+        if remarks := shared_remarks(reports):
+            say("all logs:")
+            say(indent("\n".join(remarks), "  "))
         for report, holds in zip(reports, contents, strict=True):
-            say(report.summary_beside(shared, notes))
+            say(report.summary_beside(shared, remarks))
             if holds.summary():
                 say(indent(holds.summary(), "  "))
         if len(groups) > 1:

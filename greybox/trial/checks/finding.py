@@ -180,8 +180,15 @@ class CheckReport(DisplayMixin):
         """Return the findings as text."""
         return self.summary_beside(())
 
-    def summary_beside(self, told: Sequence[Finding], notes: Sequence[str] = ()) -> str:
-        """Return findings and notes as text; of findings that were told before only the size."""
+    @property
+    def remarks(self) -> list[str]:
+        """What is said beside the findings: checks that cannot tell, actuators and notes."""
+        untold = [f"{o.id}: {o.sentence}" for o in self.outcomes if o.status == "cannot tell"]
+        actuators = [f"actuator: {a.sentence}" for a in self.actuators]
+        return [*untold, *actuators, *(f"note: {n}" for n in self.notes)]
+
+    def summary_beside(self, told: Sequence[Finding], remarks: Sequence[str] = ()) -> str:
+        """Return the report as text, without remarks that were told, of such findings the size."""
         count = len(self.findings)
         untold = sum(o.status == "cannot tell" for o in self.outcomes)
         verdict = f"{count} finding{'s' if count > 1 else ''}" if count else "clean"
@@ -192,9 +199,7 @@ class CheckReport(DisplayMixin):
         for f in self.findings:
             text = f"{f.line}, as above" if f.key in known else f.summary()
             lines += [f"  {line}" for line in text.splitlines()]
-        lines += [f"  {o.id}: {o.sentence}" for o in self.outcomes if o.status == "cannot tell"]
-        lines += [f"  actuator: {a.sentence}" for a in self.actuators]
-        lines += [f"  note: {n}" for n in self.notes if n not in notes]
+        lines += [f"  {r}" for r in self.remarks if r not in remarks]
         return "\n".join(lines)
 
     def _parts(self) -> tuple[str, ...]:
@@ -235,10 +240,10 @@ def shared_findings(reports: Sequence[CheckReport]) -> list[Finding]:
     return list(found.values())
 
 
-def shared_notes(reports: Sequence[CheckReport]) -> list[str]:
-    """Return the notes that all of several logs have."""
-    first, *others = reports
-    return [n for n in first.notes if others and all(n in r.notes for r in others)]
+def shared_remarks(reports: Sequence[CheckReport]) -> list[str]:
+    """Return what is said of all of several logs beside their findings."""
+    first, *others = (r.remarks for r in reports)
+    return [told for told in first if others and all(told in other for other in others)]
 
 
 def size_in_words(f: Finding) -> str:
