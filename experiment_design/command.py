@@ -646,7 +646,7 @@ def _run_between(
 ) -> None:
     """Design the trial between two models and write it."""
     from experiment_design.discriminate import design_between
-    from experiment_design.prepare import expected_disturbances
+    from experiment_design.prepare import expected_disturbances, require_own_commands
     from experiment_design.request.request import CandidateModel, full_structure
     from greybox.errors import UsageError
     from greybox.model.model import load_model
@@ -665,6 +665,7 @@ def _run_between(
             *notes,
         )
     other = load_model(options.between[1]).coefficient_model()
+    require_own_commands(other, request.vessel)
     if other.sample_time != request.sample_time:
         raise UsageError(
             f"'{first}' has the sample time {request.sample_time:g} s and '{second}' "

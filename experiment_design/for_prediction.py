@@ -33,11 +33,12 @@ from experiment_design.optimise.envelope_search import (
 from experiment_design.optimise.lead_in import after_lead_in
 from experiment_design.optimise.search import assess
 from experiment_design.output.result import Design, PlanPart
+from experiment_design.prepare import require_own_commands
 from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.regimes import STEADY_SECONDS, start_words
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.diagnosis.result import finite
-from greybox.errors import InfeasibleError, UsageError
+from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
 from greybox.numerics.threads import one_thread
@@ -274,14 +275,8 @@ def ranges_of_ship(
     UsageError
         The prior is of a ship with other commands.
     """
-    ranges = command_ranges(model, given)
-    if lacking := [n for n in request.schedule.commands if n not in ranges]:
-        raise UsageError(
-            f"the prior is of '{model.vessel.name}', which has no {', '.join(lacking)} as "
-            f"'{request.vessel.name}' has: give a model of this ship, or the vessel file that the "
-            f"prior was estimated with."
-        )
-    return ranges
+    require_own_commands(model, request.vessel)
+    return command_ranges(model, given)
 
 
 def operating_envelope(

@@ -93,7 +93,7 @@ def prepare_request(
     StructureError
         The model's structure has no surge speed.
     UsageError
-        Options that exclude one another.
+        Options that exclude one another, or the model is of a ship with other commands.
     InfeasibleError
         No motion within the limits keeps the wanted signs.
     """
@@ -114,9 +114,21 @@ def prepare_request(
         return replace(found, out_of_reach=told)
 
 
+def require_own_commands(model: ManoeuvringModel, vessel: Vessel) -> None:
+    """Raise where a vessel has commands that the prior model's vessel does not have."""
+    if lacking := [n for n in vessel.commands if n not in model.vessel.commands]:
+        raise UsageError(
+            f"the prior is of '{model.vessel.name}', which has no {', '.join(lacking)} as "
+            f"'{vessel.name}' has: give a model of this ship, or the vessel file that the prior "
+            f"was estimated with."
+        )
+
+
 def _prepared(
     model: ManoeuvringModel, asked: DesignRequest, vessel: Vessel | None
 ) -> PreparedRequest:
+    if vessel is not None:
+        require_own_commands(model, vessel)
     changes = (*model.changes, *(asked.prior.changes if asked.prior is not None else ()))
     notes: list[str] = [
         f"{c.sentence}, and the trial is designed for what it is from then on"

@@ -403,6 +403,9 @@ def test_a_prior_of_another_ship_is_refused() -> None:
         design_for_prediction(request, other)
     with pytest.raises(UsageError, match="'tug', which has no n as '"):
         open_causes(request, other, AskedCauses({"current": {}}, named=True))
+    for asked in (DesignRequest(duration=100.0), DesignRequest(duration=100.0, criterion="A")):
+        with pytest.raises(UsageError, match="'tug', which has no n as '"):
+            prepare_request(other, asked, request.vessel)
 
 
 @pytest.fixture(scope="module")
