@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -15,6 +14,7 @@ from experiment_design.output.result import Design
 from experiment_design.request.regimes import spell_regime
 from greybox.errors import UsageError
 from greybox.prediction.helm import find_helm
+from greybox.report.page import tie_units
 from greybox.trial.plan_parts import VALIDATION
 from greybox.vessel.vessel import Vessel
 
@@ -113,9 +113,8 @@ def signed(value: float, decimals: int = 0) -> str:
 
 
 def tie(text: str) -> str:
-    """Return text in which a line does not end between a number and its unit."""
-    tied = re.sub(r"(?<=\d) (?=(?:m/s|rad/s|kn|m|s|%|min)(?:\W|$))", "\u00a0", text)
-    return tied.replace("(N, E)", "(N,\u00a0E)")
+    """Return text in which a line ends neither between a number and its unit nor in a pair."""
+    return tie_units(text).replace("(N, E)", "(N,\u00a0E)")
 
 
 def plain_name(name: str) -> str:

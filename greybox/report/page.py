@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -115,7 +116,7 @@ _TEMPLATE = """{% macro drawn(picture) %}{% set chart = chart_of(picture) %}
 {{- "Zoom and read values" }}</button>
 <script type="application/json">{{ chart[1] | safe }}</script>
 {% endif %}
-<figcaption>{{ picture.caption }}</figcaption></figure>
+<figcaption>{{ picture.caption | tie_units }}</figcaption></figure>
 {% endmacro %}
 {% macro figures(of) %}
 {% if of.pictures %}<div class="pictures">
@@ -124,9 +125,9 @@ _TEMPLATE = """{% macro drawn(picture) %}{% set chart = chart_of(picture) %}
 {% endif %}
 {% endmacro %}
 {% macro words(of, level) %}
-{% for sentence in of.sentences %}<p>{{ sentence }}</p>
+{% for sentence in of.sentences %}<p>{{ sentence | tie_units }}</p>
 {% endfor %}
-{% if of.points %}<ul>{% for point in of.points %}<li>{{ point }}</li>
+{% if of.points %}<ul>{% for point in of.points %}<li>{{ point | tie_units }}</li>
 {% endfor %}</ul>
 {% endif %}
 {% for part in of.marked %}<{{ level }}>{{ part.title }}</{{ level }}><pre class="marked">
@@ -232,7 +233,7 @@ del { background: #f9ddcc; }
 <body>
 <h1>{{ page.title }}</h1>
 <div class="first{{ ' led' if page.lead }}">
-<p class="headline">{{ page.headline }}</p>
+<p class="headline">{{ page.headline | tie_units }}</p>
 {% if page.next_steps %}<div class="next"><h2>What to do next</h2>
 <ul>{% for step in page.next_steps %}<li>{{ step.purpose }}{% if step.command %}: <code>
 {%- for word in step.command.split(" ") %}<span>{{ word }}</span>{{ " " if not loop.last }}
@@ -294,7 +295,9 @@ def render(page: Page) -> str:
 def _template() -> Template:
     from jinja2 import Environment
 
-    return Environment(autoescape=True, trim_blocks=True).from_string(_TEMPLATE)
+    environment = Environment(autoescape=True, trim_blocks=True)
+    environment.filters["tie_units"] = tie_units
+    return environment.from_string(_TEMPLATE)
 
 
 def _policy(scripts: Sequence[str]) -> str:
@@ -304,6 +307,11 @@ def _policy(scripts: Sequence[str]) -> str:
         "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:; "
         f"style-src 'unsafe-inline'; script-src {' '.join(hashes or [_NONE])}"
     )
+
+
+def tie_units(text: str) -> str:
+    """Return text in which a line does not end between a number and its unit."""
+    return re.sub(r"(?<=\d) (?=(?:m/s|rad/s|kn|m|s|%|min)(?:\W|$))", "\u00a0", text)
 
 
 def capital(text: str) -> str:

@@ -131,7 +131,7 @@ def test_a_start_at_rest_gets_a_lead_in(folder, capsys):
     assert legs["start"]["u"] == 0
     assert sum(leg["expected"] for leg in legs["legs"]) == pytest.approx(lead + 100, rel=0.2)
     assert f"1 trial of 100 s behind a lead-in of {lead:g} s" in said
-    assert f"Before it a lead-in of {lead:g} s" in page.read_text()
+    assert f"Before it a lead-in of {lead:g}\u00a0s" in page.read_text()
     assert "lead-in from 0:00 to" in sheet.read_text()
 
 

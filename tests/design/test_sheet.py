@@ -337,7 +337,7 @@ def page(unsure):
 
 def test_the_page_says_what_is_saved(unsure, page):
     html = without_scripts(page)
-    assert "This plan saves 150 s of trial" in html
+    assert "This plan saves 150\u00a0s of trial" in html
     assert "at least 0.7 of the best possible" in html
     assert html.count("<svg") == 4
     assert html.count("<figure ") == 4

@@ -243,7 +243,7 @@ def test_commands_write_bands(tmp_path, capsys):
     band = json.loads(out.read_text())["models"][0]["logs"][0]["band"]
     assert set(band) == set(STATES)
     assert set(band["u"]) == {"coverage", "expected", "usual", "sentence"}
-    assert "Shaded: where 95 %" in page.read_text()
+    assert "Shaded: where 95\u00a0%" in page.read_text()
     assert load_model(model).noise is not None
     without = compare({"m": load_model(model)}, log, bands=False)
     assert without.to_dict()["models"][0]["logs"][0]["band"] == {}
