@@ -30,9 +30,7 @@ BACKWARDS = 3
 
 # -- a cause stands beside a force without a name (standing) -----------------------------------
 # share of what a generic force of the cause's own arguments gains that the cause must take, with
-# fewer numbers, and the share that the 95 % interval must lie above. The latter is enough where its
-# number is beyond doubt among all that were tried (`SIGNIFICANT`): on two foreign catamarans a weak
-# thruster of 0.76 ± 0.02 took 67 and 78 %, as thrusters have more that no term is there for
+# fewer numbers, and the share that the 95 % interval must lie above
 OWN_SHARE, LEAST_SHARE = 0.8, 0.5
 # significance of a hull's term whose movement beside that force counts as a standard error: one
 # standard error. Foreign ships in wind: at 5 % a true coupling fell at 0.053, and with it the wind.

@@ -85,14 +85,8 @@ class Standing:
     def stands(self) -> bool:
         """Whether the cause explains what no generic force explains as well."""
         gains = self.beyond.gain > 0 and self.beyond.p_value < self.level
-        most = self.share is not None and (self.share >= OWN_SHARE or self._beyond_doubt)
-        own = most and self.half < self.level
+        own = self.share is not None and self.share >= OWN_SHARE and self.half < self.level
         return (gains or own) and self.clear < PROVEN and self._sure
-
-    @property
-    def _beyond_doubt(self) -> bool:
-        """Whether one of its numbers is sure beside that force among all causes tried (Holm)."""
-        return self.tried * self.told < SIGNIFICANT
 
     @property
     def _sure(self) -> bool:
@@ -100,7 +94,7 @@ class Standing:
         if self.sought or np.isinf(self.beyond.gain):
             # many a cause keeps a run within bounds, and many a moment follows a misfit: its number
             # alone speaks for it, and was the best of all that were tried
-            return self._beyond_doubt
+            return self.tried * self.told < SIGNIFICANT
         return self.told < self.known
 
 
