@@ -17,13 +17,16 @@ from greybox.commands.common import (
     add_seed,
     at_least_one,
     count,
+    drawn,
     positive,
     progress,
     provenance,
     require_ending,
     say,
     show_next,
+    tell_drawing,
 )
+from greybox.commands.time_left import Stage
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.registry import Registry
 
@@ -339,6 +342,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_cluster(work)
     add_seed(work)  # type: ignore[arg-type]
+
+
+def stages(options: argparse.Namespace) -> list[Stage]:
+    """Return the shares of the time that each stage usually takes."""
+    if _purpose(options, _given(options)).whole:
+        search = [("read model", 15.0), ("settings are exchanged", 60.0)]
+    else:
+        shortest = [("duration", 150.0)] if options.target else []
+        search = [("read model", 40.0), *shortest, ("design:", 60.0), ("solved", 10.0)]
+    return [("", 5.0), *search, *drawn(options, 8.0)]
 
 
 def run(options: argparse.Namespace) -> None:
@@ -722,6 +735,7 @@ def _show(
     headline: str = "",
 ) -> None:
     """Write the sheet and the page that were asked for."""
+    tell_drawing()
     if options.sheet:
         from experiment_design.output.trial_sheet import write_sheet
 

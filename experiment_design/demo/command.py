@@ -6,7 +6,8 @@ import argparse
 import logging
 import textwrap
 
-from greybox.commands.common import add_seed, provenance, say
+from greybox.commands.common import add_seed, provenance, say, tell_drawing
+from greybox.commands.time_left import Stage
 
 HELP = "run the whole loop on a virtual ship: design, sail, estimate, diagnose, extend, redesign"
 EXAMPLES = """examples:
@@ -32,6 +33,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--open", action="store_true", help="open the page when it is done")
     add_seed(parser)
+
+
+def stages(options: argparse.Namespace) -> list[Stage]:
+    """Return the shares of the time that each stage usually takes."""
+    return [
+        ("", 1.0), ("designing the first trial", 21.0), ("sailing", 3.0), ("checking the log", 3.0),
+        ("estimating", 2.0), ("log checks", 8.0), ("model without causes", 6.0),
+        ("designing the next trial", 28.0), ("drawing the page", 10.0),
+    ]  # fmt: skip
 
 
 def run(options: argparse.Namespace) -> None:
@@ -60,7 +70,7 @@ def run(options: argparse.Namespace) -> None:
         demo = run_demo(
             options.out, effect=options.effect, seed=options.seed, tell=tell, progress=_log.info
         )
-        _log.info("drawing")
+        tell_drawing()
         report = demo.files.report
         record = provenance(options) | {"files": demo.files.hashes()}
         write_page(demo_page(demo, record), report)

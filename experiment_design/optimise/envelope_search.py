@@ -7,6 +7,7 @@ never near. Several chains start from the best of random sequences of these sett
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -20,6 +21,7 @@ from experiment_design.optimise.search import Candidate, limit_scale, to_unit
 from experiment_design.request.problem import TrialProblem
 from greybox.numerics.parallel import map_forked
 
+_log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 # random sequences that a search begins with, and that a plan is compared with
@@ -297,6 +299,7 @@ def exchange_settings(
             pool = better(pool + judged(children))
         return pool[0]
 
+    _log.info("settings are exchanged: %d chains of %d rounds", _CHAINS, rounds)
     found = better(map_forked(chain, range(_CHAINS), workers=workers))
     # the sides and speeds that a sequence goes to are no limits of the trial
     keeping = [(p, c) for p, c in random if (c.missed[:-1] <= TOLERANCE).all()]

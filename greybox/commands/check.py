@@ -5,11 +5,20 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from greybox.commands.common import VESSEL_HELP, add_memory, provenance, say, show_next
+from greybox.commands.common import (
+    VESSEL_HELP,
+    add_memory,
+    counted,
+    progress,
+    provenance,
+    say,
+    show_next,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from greybox.commands.time_left import Stage
     from greybox.trial.checks.finding import CheckReport
     from greybox.trial.log_files import LogFile
 
@@ -57,6 +66,12 @@ def _groups(files: Sequence[LogFile], memory: float) -> list[list[LogFile]]:
     return groups
 
 
+def stages(options: argparse.Namespace) -> list[Stage]:
+    """Return the shares of the time that each stage usually takes."""
+    found = [("reading", 4.0), ("samples of", 8.0), ("axes", 35.0), ("wind", 33.0)]
+    return [*found, ("manoeuvres", 8.0), *([("pictures", 80.0)] if options.report else [])]
+
+
 def run(options: argparse.Namespace) -> None:
     """Run the command: read the logs, check them, show the findings."""
     from dataclasses import replace
@@ -65,8 +80,9 @@ def run(options: argparse.Namespace) -> None:
 
     from greybox.files import check_targets, write_json
     from greybox.report.next_steps import after_check
-    from greybox.trial.checks.check import check_files, require_each_once
+    from greybox.trial.checks.check import check_recordings, require_each_once
     from greybox.trial.checks.finding import shared_findings, shared_remarks
+    from greybox.trial.convert.channel_mapping import read_recording
     from greybox.trial.log_files import find_logs
     from greybox.trial.repair import apply_repairs
     from greybox.trial.trial_summary import Contents, describe_recording
@@ -81,14 +97,16 @@ def run(options: argparse.Namespace) -> None:
     reports: list[CheckReport] = []
     contents: list[Contents] = []
     for group in groups:
-        found = check_files([file.path for file in group], vessel)
+        found = check_recordings(
+            [read_recording(file.path, vessel) for file in counted("reading logs", group)], vessel
+        )
         contents += [
             describe_recording(
                 apply_repairs(r.recording, [f for f in r.findings if f.safe]), vessel
             )
             if r.recording is not None
             else Contents()
-            for r in found
+            for r in counted("manoeuvres in logs", found)
         ]
         reports += [replace(r, recording=None) for r in found] if len(groups) > 1 else found
     record = provenance(options)
@@ -107,7 +125,8 @@ def run(options: argparse.Namespace) -> None:
     if options.report:
         from greybox.report.checks import check_page
 
-        check_page(reports, paths, vessel, options.report, record)
+        shown = progress("pictures of logs")
+        check_page(reports, paths, vessel, options.report, record, progress=shown)
     if options.json != "-":
         shared = shared_findings(reports)
         for finding in shared:

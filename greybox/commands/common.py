@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import platform
 import shlex
 from collections.abc import Callable, Mapping, Sequence
@@ -11,9 +12,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from greybox.commands.terminal import complain, progress, say
+from greybox.commands.terminal import complain, counted, progress, say
 
 if TYPE_CHECKING:
+    from greybox.commands.time_left import Stage
     from greybox.report.next_steps import NextStep
     from greybox.report.page import Page
     from greybox.trial.log import TrialLog
@@ -22,10 +24,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "VESSEL_HELP", "add_cluster", "add_logs", "add_memory", "add_outputs", "add_seed",
-    "at_least_one", "complain", "configured", "count", "leave_to_others", "positive",
-    "progress", "provenance", "publish", "read_logs", "say", "show_next",
+    "at_least_one", "complain", "configured", "count", "counted", "drawn", "leave_to_others",
+    "positive", "progress", "provenance", "publish", "read_logs", "say", "show_next",
+    "tell_drawing",
 ]  # fmt: skip
 
+_log = logging.getLogger(__name__)
+# what is told while pages are made
+_DRAWING = "drawing the page"
 # endings that name a format
 _ENDINGS = (".csv", ".parquet", ".pq", ".json", ".toml", ".html", ".pdf", ".png", ".svg")
 # GiB that logs and what is made of them may take by default, those of a usual machine
@@ -33,7 +39,8 @@ _MEMORY = 4.0
 VESSEL_HELP = "vessel file (TOML), as 'greybox import --help' shows one, or thesis or ferry"
 # where a command computes changes no result
 SHELL_ONLY = (
-    "run", "typed", "verbose", "more_verbose", "quiet", "no_config", "configuration", "cluster",
+    "run", "stages", "typed", "verbose", "more_verbose", "quiet", "no_config", "configuration",
+    "cluster",
 )  # fmt: skip
 
 
@@ -83,12 +90,23 @@ def publish(
     if options.report:
         from greybox.report.page import write_page
 
+        tell_drawing()
         write_page(page(), options.report)
     if options.json != "-":
         say(summary)
         for path in filter(None, (*written, options.report)):
             say(f"wrote {path}")
         show_next(next_steps)
+
+
+def tell_drawing() -> None:
+    """Tell that a page is being made."""
+    _log.info(_DRAWING)
+
+
+def drawn(options: argparse.Namespace, share: float) -> list[Stage]:
+    """Return the stage of making the page, where one is asked for."""
+    return [(_DRAWING, share)] if options.report else []
 
 
 def show_next(steps: Sequence[NextStep]) -> None:
@@ -178,7 +196,7 @@ def read_logs(
     misnamed: list[str] = []
     told: list[str] = []
     refused: LogError | None = None
-    for file in find_logs(paths):
+    for file in counted("reading logs", find_logs(paths)):
         try:
             with local_copy(file.path) as path:
                 segments = read_segments(path, vessel, states=states)

@@ -5,11 +5,20 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from greybox.commands.common import add_memory, add_outputs, add_seed, provenance, publish
+from greybox.commands.common import (
+    add_memory,
+    add_outputs,
+    add_seed,
+    counted,
+    drawn,
+    provenance,
+    publish,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from greybox.commands.time_left import Stage
     from greybox.model.model import ManoeuvringModel
     from greybox.report.page import Page
     from greybox.trial.log import TrialLog
@@ -60,7 +69,7 @@ def _read_each(
     from greybox.trial.convert.read import read_log
 
     refused: LogError | None = None
-    for file in files:
+    for file in counted("reading logs", files):
         try:
             logs = [
                 read_log(file.path, m.vessel, states=m.structure.states, gaps=True) for m in models
@@ -84,6 +93,11 @@ def _own_logs(name: str, model: ManoeuvringModel, hashes: Sequence[str]) -> str:
     which = "these logs" if count == len(hashes) else f"{count} of these {len(hashes)} logs"
     told = f"'{name}' was estimated on {which}: how it fits there says little of other logs."
     return told if count else ""
+
+
+def stages(options: argparse.Namespace) -> list[Stage]:
+    """Return the shares of the time that each stage usually takes."""
+    return [("reading", 15.0), ("comparing", 25.0), *drawn(options, 60.0)]
 
 
 def run(options: argparse.Namespace) -> None:
@@ -120,8 +134,9 @@ def run(options: argparse.Namespace) -> None:
         whole = MOST_LOGS if options.report else 0
     else:
         # a log that cannot be read is told before the others are compared
-        columns = list(columns)
-        require_distinct([logs[0] for logs in columns])
+        held = list(columns)
+        require_distinct([logs[0] for logs in held])
+        columns = counted("comparing logs", held)
     comparison = compare_each(
         named, columns, heading=options.heading, bands=not options.no_bands, seed=options.seed,
         whole=whole,

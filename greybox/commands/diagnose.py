@@ -11,6 +11,7 @@ from greybox.commands.common import (
     add_memory,
     add_outputs,
     add_seed,
+    drawn,
     positive,
     provenance,
     publish,
@@ -22,6 +23,7 @@ from greybox.numerics.threads import one_thread
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from greybox.commands.time_left import Stage
     from greybox.diagnosis.result import Diagnosis
     from greybox.report.page import Page
     from greybox.selection.stretches import Drawn
@@ -89,6 +91,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_seed(parser)
     add_cluster(parser)
+
+
+def stages(options: argparse.Namespace) -> list[Stage]:
+    """Return the shares of the time that each stage usually takes."""
+    of_terms = [] if options.model else [("terms that the data choose", 25.0)]
+    return [
+        ("", 5.0), ("samples of", 4.0), ("axes", 15.0), ("model without causes", 25.0),
+        ("step 1", 9.0), ("a generic force", 4.0), *of_terms, ("what is left", 1.0),
+        ("gain", 12.0), *drawn(options, 18.0),
+    ]  # fmt: skip
 
 
 @one_thread()

@@ -13,6 +13,7 @@ from greybox.commands.common import (
     add_outputs,
     add_seed,
     configured,
+    drawn,
     leave_to_others,
     positive,
     progress,
@@ -27,6 +28,7 @@ from greybox.numerics.effort import EFFORT
 from greybox.numerics.threads import one_thread
 
 if TYPE_CHECKING:
+    from greybox.commands.time_left import Stage
     from greybox.estimation.result import Estimate
     from greybox.report.page import Page
     from greybox.selection.estimate_stream import StreamEstimate
@@ -341,6 +343,21 @@ def _with_verdict_of(estimate: Estimate, judged: Estimate) -> Estimate:
     if any(isinstance(r, Divergence | HeldCommandsDiverge) for r in own):
         return estimate
     return replace(estimate, prediction=judged.prediction)
+
+
+def stages(options: argparse.Namespace) -> list[Stage]:
+    """Return the shares of the time that each stage usually takes."""
+    # what is named is taken as it is
+    searches = (
+        ("coefficients left out", options.reduce),
+        ("structures compared", options.compare_structures),
+        ("selection of terms", not (options.method or options.predictor or options.structure)),
+    )
+    return [
+        ("", 15.0), ("ways to estimate", 20.0),
+        *((words, 60.0) for words, made in searches if made),
+        ("verdict on predictions", 6.0), *drawn(options, 25.0),
+    ]  # fmt: skip
 
 
 @one_thread()

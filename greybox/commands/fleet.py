@@ -9,6 +9,7 @@ from greybox.commands.common import (
     add_cluster,
     add_outputs,
     add_seed,
+    drawn,
     progress,
     provenance,
     publish,
@@ -16,6 +17,7 @@ from greybox.commands.common import (
 )
 
 if TYPE_CHECKING:
+    from greybox.commands.time_left import Stage
     from greybox.report.page import Page
 
 HELP = "estimate many ships of a class: what they share, which ship differs, what changes over time"
@@ -54,6 +56,11 @@ def _require_outside(options: argparse.Namespace) -> None:
                 f"--{name} names '{path}' in the folder of a ship, where it would be taken for one "
                 f"of its files: name a file outside."
             )
+
+
+def stages(options: argparse.Namespace) -> list[Stage]:
+    """Return the shares of the time that each stage usually takes."""
+    return [("", 10.0), ("ships", 80.0), *drawn(options, 10.0)]
 
 
 def run(options: argparse.Namespace) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from greybox.commands.common import (
     VESSEL_HELP,
     positive,
+    progress,
     provenance,
     require_log_ending,
     say,
@@ -15,6 +16,7 @@ from greybox.commands.common import (
 )
 
 if TYPE_CHECKING:
+    from greybox.commands.time_left import Stage
     from greybox.trial.convert.options import ImportOptions
 
 HELP = "convert raw files to logs: CSV, Parquet, NMEA 0183, MATLAB, ROS bags, MCAP"
@@ -143,6 +145,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", metavar="F", help="write the record as JSON; - is stdout")
 
 
+def stages(options: argparse.Namespace) -> list[Stage]:
+    """Return the shares of the time that each stage usually takes."""
+    judged = [("samples of", 15.0), ("axes", 40.0), ("wind", 15.0)]
+    checked = judged if options.fix or options.fix_also else []
+    return [("", 10.0), *checked, ("logs made", 25.0)]
+
+
 def run(options: argparse.Namespace) -> None:
     """Read, merge, mend, resample, write."""
     from pathlib import Path
@@ -188,6 +197,7 @@ def run(options: argparse.Namespace) -> None:
         fix_not=tuple(options.fix_not),
         reader={"topics": topics} if topics else {},
         extra=provenance(options),
+        progress=progress("logs made"),
     )
     records: list[Any] = [read_record(log) for log in logs]
     if options.json:

@@ -73,7 +73,7 @@ def build_parser(only: str | None = None) -> Parser:
         module.add_arguments(sub)
         sub.usage, sub.whole = sub.short_usage(), build_parser
         _add_shell(sub.add_argument_group("output and configuration"), "more_verbose")
-        sub.set_defaults(run=module.run)
+        sub.set_defaults(run=module.run, stages=getattr(module, "stages", None))
     topic = commands.add_parser("help", help="show the help of a command", add_help=False)
     topic.add_argument("topic", nargs="?", choices=known, metavar="COMMAND")
     return parser
@@ -147,7 +147,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _require_utf8(given)
             options = _parse(given)
             name = f"greybox {options.command}"
-            with telling(options.verbose + getattr(options, "more_verbose", 0), options.quiet):
+            verbose = options.verbose + getattr(options, "more_verbose", 0)
+            stages = getattr(options, "stages", None)
+            with telling(verbose, options.quiet, stages(options) if stages else ()):
                 _run(options)
         finally:
             # what a full disk refuses is told here, and not when the interpreter ends

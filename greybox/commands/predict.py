@@ -9,6 +9,7 @@ from greybox.commands.common import (
     add_outputs,
     add_seed,
     count,
+    drawn,
     positive,
     progress,
     provenance,
@@ -18,6 +19,7 @@ from greybox.commands.common import (
 )
 
 if TYPE_CHECKING:
+    from greybox.commands.time_left import Stage
     from greybox.prediction.result import ManoeuvrePrediction
     from greybox.report.page import Page
     from greybox.trial.log import TrialLog
@@ -130,6 +132,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--draws", type=count, default=256, help="number of draws of the parameters (256)"
     )
     add_seed(parser)
+
+
+def stages(options: argparse.Namespace) -> list[Stage]:
+    """Return the shares of the time that each stage usually takes."""
+    return [("", 8.0), ("manoeuvres", 75.0), *drawn(options, 20.0)]
 
 
 def run(options: argparse.Namespace) -> None:

@@ -5,25 +5,34 @@ from __future__ import annotations
 import logging
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from datetime import timedelta
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, TextIO, TypeVar
 
+from greybox.commands.time_left import Stage, TimeLeft, in_words
 from greybox.numerics.effort import seconds_left
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+
+Item = TypeVar("Item")
 
 LOGGERS = ("greybox", "experiment_design")
 _QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
 _VERDICT = r"(?m)^((?:[Vv]erdict|Prediction|Coefficients): )(do not trust|trust except|\w+)"
 # red and green; other verdicts are yellow
 _TONES = {"do not trust": 31, "poor": 31, "unexplained": 31, "trust": 32, "good": 32, "none": 32}
-# the bar that is on the screen: one at most
+# the bar that is on the screen: one at most, and drawn by the first process, not by its copies
 _shown: list[Progress] = []
+_FIRST = os.getpid()
+_left: ContextVar[TimeLeft | None] = ContextVar("left", default=None)
+# seconds between two pictures of the bar, columns of the bar and of the time beside it
+_AGAIN, _BAR, _TIME = 0.25, 16, 18
 
 
 def coloured(stream: TextIO) -> bool:
@@ -57,6 +66,7 @@ def say(text: str) -> None:
 
 def clear() -> None:
     """Take the bar off the screen."""
+    _draw_again(0)
     while _shown:
         _shown.pop().stop()
 
@@ -65,12 +75,20 @@ def _show(text: str, done: int = 0, total: int | None = None) -> None:
     """Show what is being done: of some steps how many, with the time that is left."""
     if _QUIET.get() or not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
         return
-    counting = bool(_shown) and _shown[0].tasks[0].total is not None
-    if done == total or (total is not None and not counting):
-        clear()
-    # steps that are counted stay on the screen while parts of one are told
-    if done == total or (total is None and counting):
+    if os.getpid() != _FIRST:
         return
+    counting = bool(_shown) and _shown[0].tasks[0].fields["counting"]
+    # steps that are counted stay on the screen while parts of one are told
+    if total is None and counting:
+        return
+    left = _left.get()
+    if left is None:
+        _left.set(left := TimeLeft())
+    left.tell(text, done, total)
+    if done == total:
+        clear()
+        return
+    _draw_again(0)
     if not _shown:
         from rich import progress as rich
         from rich.console import Console
@@ -78,25 +96,60 @@ def _show(text: str, done: int = 0, total: int | None = None) -> None:
 
         console = Console(stderr=True)
         # what is said may be long: the time beside it stays on the line
-        room = Column(no_wrap=True, max_width=max(console.width - 12, 1))
+        room = Column(no_wrap=True, max_width=max(console.width - _BAR - _TIME - 5, 1))
         what = rich.TextColumn("{task.description}", markup=False, table_column=room)
-        left = (rich.BarColumn(), rich.TimeRemainingColumn(), "left")
-        # steps may take minutes, so the time left is told by all of them
+        when = rich.TextColumn("{task.fields[time]}", table_column=Column(no_wrap=True))
+        # a thread that draws would keep the work from being shared with copies of this process
         bar = rich.Progress(
-            rich.SpinnerColumn(), what, *(left if total else [rich.TimeElapsedColumn()]),
-            console=console, transient=True, speed_estimate_period=float("inf"),
-            redirect_stdout=False, redirect_stderr=False,
+            rich.SpinnerColumn(), what, rich.BarColumn(_BAR), when, console=console,
+            transient=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False,
         )  # fmt: skip
-        bar.add_task("", total=total)
+        bar.add_task("", total=None, time="", counting=False)
         bar.start()
         _shown.append(bar)
-    task = _shown[0].task_ids[0]
-    _shown[0].update(task, description=_printable(text), completed=done, total=total, refresh=True)
+    _shown[0].update(
+        _shown[0].task_ids[0], description=_printable(text), counting=total is not None
+    )
+    _draw()
+
+
+def _draw(*_: object) -> None:
+    """Draw the bar with the time that is left by now, and again in a while."""
+    left = _left.get()
+    if not _shown or left is None:
+        return
+    bar, limit = _shown[0], seconds_left()
+    seconds, share = left.seconds(), left.share()
+    if seconds is not None:
+        when = in_words(min(seconds, max(limit, 0)))
+    elif limit < float("inf"):
+        when = f"at most {timedelta(0, int(max(limit, 0)))} left"
+    else:
+        when = str(timedelta(0, int(bar.tasks[0].elapsed or 0)))
+    total = None if share is None else 1.0
+    bar.update(bar.task_ids[0], time=when, completed=share or 0.0, total=total)
+    bar.refresh()
+    _draw_again(_AGAIN)
+
+
+def _draw_again(seconds: float) -> None:
+    """Let the bar be drawn after some seconds, 0 for never, where the system can wake a process."""
+    if hasattr(signal, "setitimer") and signal.getsignal(signal.SIGALRM) is _draw:
+        signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
 def progress(title: str) -> Callable[[int, int], None]:
     """Return a callback that shows progress on a terminal and is silent elsewhere."""
     return lambda done, total: _show(f"{title}: {done} of {total}", done, total)
+
+
+def counted(title: str, items: Sequence[Item]) -> Iterator[Item]:
+    """Yield items, and show on a terminal how many of them are done."""
+    show = progress(title)
+    for k, item in enumerate(items):
+        show(k, len(items))
+        yield item
+    show(len(items), len(items))
 
 
 class _Teller(logging.Handler):
@@ -113,16 +166,15 @@ class _Teller(logging.Handler):
             # seconds since the program began
             sys.stderr.write(f"[{record.relativeCreated / 1000:7.2f} s] {name}{text}\n")
         else:
-            left = seconds_left()
-            limit = "" if left == float("inf") else f" (at most {timedelta(0, int(left))} left)"
-            _show(text + limit)
+            _show(text)
 
 
 @contextmanager
-def telling(verbose: int, quiet: bool) -> Iterator[None]:
+def telling(verbose: int, quiet: bool, stages: Sequence[Stage] = ()) -> Iterator[None]:
     """Tell what is done while the block runs: ``verbose`` 1 in few lines, 2 in all, 0 by a bar.
 
-    Results and the bar are not shown where ``quiet`` is asked for.
+    Results and the bar are not shown where ``quiet`` is asked for. The bar tells the time that is
+    left by the ``stages`` that are to come, see `TimeLeft`.
     """
     teller = _Teller()
     teller.lines = verbose > 0
@@ -135,5 +187,11 @@ def telling(verbose: int, quiet: bool) -> Iterator[None]:
             logger.addHandler(teller)
             logger.setLevel(logging.DEBUG if verbose > 1 else logging.INFO)
         undo.callback(_QUIET.reset, _QUIET.set(quiet))
+        undo.callback(_left.reset, _left.set(TimeLeft(stages)))
+        main = threading.current_thread() is threading.main_thread()
+        if main and hasattr(signal, "setitimer") and sys.stderr.isatty():
+            undo.callback(signal.signal, signal.SIGALRM, signal.signal(signal.SIGALRM, _draw))
+            # reading and writing go on where they were
+            signal.siginterrupt(signal.SIGALRM, False)
         undo.callback(clear)
         yield

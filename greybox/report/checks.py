@@ -108,6 +108,8 @@ def check_page(
     vessel: Vessel,
     target: str | Path,
     record: Mapping[str, Any] | None = None,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Write one page on what is wrong with some logs.
 
@@ -122,6 +124,8 @@ def check_page(
         HTML file, replaced in one step.
     record : mapping, optional
         How it was computed: versions, command, hashes of the files.
+    progress : callable
+        Called with (done, total) logs.
     """
     signals = sum(len(r.recording.signals) for r in reports if r.recording is not None)
     points = points_for(signals)
@@ -130,7 +134,11 @@ def check_page(
         if report.recording is not None:
             for f in report.findings:
                 shown.setdefault(f.key, report.name)
-    sections = [_section(k, r, vessel, points, shown) for k, r in enumerate(reports)]
+    sections = []
+    for k, report in enumerate(reports):
+        progress(k, len(reports))
+        sections.append(_section(k, report, vessel, points, shown))
+    progress(len(reports), len(reports))
     lead, sections = _apart(reports, sections)
     made = computed(record or {}) | {"vessel": vessel.name}
     for report, path in zip(reports, paths, strict=True):

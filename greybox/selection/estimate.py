@@ -353,6 +353,7 @@ def _judged(
     estimate: Estimate, logs: Sequence[TrialLog], request: Request, refit: Refit | None = None
 ) -> Estimate:
     """Return the estimate with the verdict on its predictions, which has time of its own."""
+    _log.info("verdict on predictions")
     seconds = max(seconds_left(), request.effort * _FOR_VERDICT)
     with without_limit(), within(seconds):
         return with_prediction(estimate, logs, request, refit)
@@ -447,6 +448,7 @@ def _or_selected_terms(
     """
     before = f"{found.method} of structure '{found.predictor.structure.name}'"
     size = len(found.predictor.parameter_columns)
+    _log.info("selection of terms")
     try:
         with within(_FOR_TERMS * seconds_left()):
             choice = select_terms(logs, before, size, refit_found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -56,6 +56,7 @@ def import_files(
     fix_not: tuple[str, ...] = (),
     reader: Mapping[str, Any] | None = None,
     extra: Mapping[str, Any] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> str:
     """Import raw files into one log, or each into a log of a folder.
 
@@ -80,6 +81,8 @@ def import_files(
         Handed to the readers, such as ``topics``.
     extra : mapping, optional
         More entries of the record.
+    progress : callable
+        Called with (done, total) logs that are written.
 
     Returns
     -------
@@ -101,21 +104,24 @@ def import_files(
         trials = [([path], target) for path, target in zip(paths, targets(paths, out), strict=True)]
     for path in paths:
         _keep_source(path, [target for _, target in trials])
-    summaries = []
+    summaries: list[str] = []
     with _all_or_none(folder, [target for _, target in trials]) as logs:
         if not mending:
             for (files, _), target in zip(trials, logs, strict=True):
+                progress(len(summaries), len(logs))
                 summaries.append(_import_trial(files, vessel, target, options, reader, extra))
         else:
             recordings = [read_trial(files, vessel, **(reader or {})) for files, _ in trials]
             reports = check_recordings(recordings, vessel)
             while recordings:
+                progress(len(summaries), len(logs))
                 recording, target = recordings.pop(0), logs[len(summaries)]
                 mended, fixed, left = repair(
                     recording, reports[len(summaries)], also=fix_also, without=fix_not
                 )
                 lines = [f"mended: {n}" for n in fixed] + [f"left as it is: {n}" for n in left]
                 summaries.append(_write(mended, vessel, target, options, extra, lines))
+        progress(len(logs), len(logs))
     return "\n".join(summaries)
 
 

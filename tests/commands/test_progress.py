@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import pty
 import re
 import subprocess
 import sys
+from argparse import Namespace
+from contextlib import suppress
+from pathlib import Path
 
+import pytest
+
+from greybox.commands.main import build_parser
+from greybox.commands.parser import sub_parsers
+from greybox.commands.time_left import TimeLeft, in_words
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("greybox", "experiment_design")
 SCRIPT = """
 from greybox.commands.common import progress
 show = progress("design")
@@ -20,15 +32,17 @@ def on_a_terminal(*arguments: str, **environment: str) -> tuple[int, str]:
     """Run Python with its standard error on a pseudo-terminal; its status and what was shown."""
     master, slave = pty.openpty()
     given = {k: v for k, v in os.environ.items() if k != "NO_COLOR"} | environment
-    try:
-        done = subprocess.run(
-            [sys.executable, *arguments], stderr=slave, stdout=subprocess.DEVNULL, timeout=120,
-            env=given,
-        )  # fmt: skip
-        return done.returncode, os.read(master, 10_000).decode()
-    finally:
+    shown = b""
+    with subprocess.Popen(
+        [sys.executable, *arguments], stderr=slave, stdout=subprocess.DEVNULL, env=given
+    ) as process:
         os.close(slave)
-        os.close(master)
+        # the end of a terminal that nobody writes to any more is an error
+        with suppress(OSError):
+            while part := os.read(master, 10_000):
+                shown += part
+    os.close(master)
+    return process.returncode, shown.decode()
 
 
 def on_the_screen(shown: str) -> str:
@@ -100,3 +114,120 @@ def test_silent_in_a_pipe():
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, timeout=60)
     assert done.stderr == b""
     assert done.stdout == b""
+
+
+class Clock:
+    """Seconds that pass when they are told to."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_the_time_left_follows_the_usual_shares_of_stages() -> None:
+    clock = Clock()
+    left = TimeLeft([("", 10.0), ("samples", 30.0), ("pictures", 60.0)], clock)
+    left.tell("read the vessel")
+    assert left.seconds() is None
+    clock.now = 5.0
+    left.tell("samples of 3 logs")
+    assert left.seconds() == pytest.approx(45.0)
+    clock.now = 15.0
+    assert left.seconds() == pytest.approx(35.0)
+    # twice as slow as usual: the pictures will be, too
+    clock.now = 40.0
+    assert left.seconds() == pytest.approx(60.0)
+    left.tell("pictures of logs: 0 of 4", 0, 4)
+    clock.now = 70.0
+    left.tell("pictures of logs: 2 of 4", 2, 4)
+    assert left.seconds() == pytest.approx(30.0)
+    assert left.share() == pytest.approx(0.7)
+
+
+def test_a_stage_that_never_came_takes_no_time() -> None:
+    clock = Clock()
+    left = TimeLeft([("", 10.0), ("terms", 50.0), ("gain", 10.0)], clock)
+    left.tell("read")
+    clock.now = 10.0
+    left.tell("gain")
+    assert left.seconds() == pytest.approx(10.0)
+
+
+def test_counted_steps_need_no_stages() -> None:
+    clock = Clock()
+    left = TimeLeft(clock=clock)
+    for done, now in enumerate((0.0, 4.0, 8.0)):
+        clock.now = now
+        left.tell(f"runs: {done} of 10", done, 10)
+    assert left.seconds() == pytest.approx(32.0)
+
+
+def test_time_is_told_as_coarsely_as_it_is_known() -> None:
+    told = [in_words(s) for s in (3.0, 21.7, 133.0, 9000.0)]
+    assert told == ["a few seconds left", "about 20 s left", "about 2 min left", "about 2.5 h left"]
+
+
+def test_the_bar_counts_down_and_leaves_processes_to_the_work() -> None:
+    """It is drawn between two messages, and by no thread, beside which nothing could be shared."""
+    script = """
+import logging, time
+from greybox.commands.terminal import telling
+from greybox.numerics.parallel import lanes, map_forked
+log, before = logging.getLogger("greybox.any"), lanes()
+def work(_):
+    log.info("told by a copy")
+with telling(0, False, [("", 1.0), ("second", 20.0)]):
+    log.info("first")
+    time.sleep(2.1)
+    log.info("second")
+    assert lanes() == before
+    map_forked(work, range(2))
+    time.sleep(5)
+"""
+    status, shown = on_a_terminal("-c", script, NO_COLOR="1")
+    assert status == 0
+    assert len(set(re.findall(r"about \d+ s left", shown))) > 1
+    assert "told by a copy" not in shown
+    assert on_the_screen(shown) == ""
+
+
+def texts_outside_stages() -> str:
+    """Return all text of the sources but that of the functions that list stages."""
+    found: list[str] = []
+    for path in (p for f in PACKAGES for p in (ROOT / f).rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        listed = {
+            id(inside)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.FunctionDef) and node.name == "stages"
+            for inside in ast.walk(node)
+        }
+        constants = (n for n in ast.walk(tree) if isinstance(n, ast.Constant))
+        found += [str(n.value) for n in constants if id(n) not in listed]
+    return "\n".join(found)
+
+
+def test_every_stage_is_told_by_something() -> None:
+    """A stage whose words nothing tells would count for ever."""
+    told, found = texts_outside_stages(), 0
+    every = {"purpose": "coefficients", "target": [""], "report": "page.html", "fix": True}
+    for given in (every, every | {"purpose": "prediction"}):
+        for parser in sub_parsers(build_parser()).values():
+            stages = parser.get_default("stages")
+            blank = {a.dest: a.default for a in parser._actions}
+            for words, share in stages(Namespace(**blank | given)) if stages else ():
+                found += 1
+                # numbers and colons are put behind the text that the sources hold
+                assert re.sub(r"[ :\d]+$", "", words) in told, f"nothing tells '{words}'"
+                assert share > 0
+    assert found > 30
+
+
+def test_a_check_on_a_terminal_tells_the_time_that_is_left(noisy_csv: Path) -> None:
+    page = str(noisy_csv.with_suffix(".html"))
+    given = ["-m", "greybox", "check", str(noisy_csv), "--vessel", "thesis", "--report", page]
+    status, shown = on_a_terminal(*given, NO_COLOR="1")
+    assert status == 0
+    assert "pictures of logs: 0 of 1" in shown
+    assert " left" in shown
