@@ -202,6 +202,59 @@ def test_times_of_day_go_on_past_midnight(tmp_path):
     np.testing.assert_allclose(np.diff(recording["u"].t), 1)
 
 
+@pytest.mark.parametrize("form", ["%I:%M:%S %p", "%Y-%m-%d %I:%M:%S %p", "%I:%M:%S.0%p"])
+def test_a_clock_of_twelve_hours_goes_past_noon_and_midnight(tmp_path, form):
+    """Hours 12 AM and 12 PM are 0 and 12: a column over both has even steps."""
+    stamps = pd.date_range("2024-05-01 11:50:00", periods=1500, freq="min")
+    table = frame(len(stamps)).drop(columns="t").assign(time=stamps.strftime(form).str.lower())
+    table.to_csv(tmp_path / "x.csv", index=False)
+    recording = read_recording(tmp_path / "x.csv", VESSEL)
+    np.testing.assert_allclose(np.diff(recording["u"].t), 60)
+
+
+def test_an_hour_that_no_half_of_a_day_has_is_no_time(tmp_path):
+    table = frame().assign(t=[f"02:15:{k:02} PM" for k in range(50)])
+    table.loc[7, "t"] = "14:15:07 PM"
+    table.to_csv(tmp_path / "x.csv", index=False)
+    recording = read_recording(tmp_path / "x.csv", VESSEL)
+    assert "column 't' holds what is no time in 1 row: read as missing" in recording.notes
+    assert np.isnan(recording["u"].t).sum() == 1
+
+
+SIDED = {
+    "behind": ["10.0 S", "10.0 P", "0.0 P", "2.5 s", "7"],
+    "before": ["S10", "P 10", "P 0", "S 2.5", "7"],
+    "words": ["10 Starboard", "Port: 10", "0 port", "STBD 2.5", "7"],
+    "degrees": ["10° S", "10°P", "0 P", "2.5 deg S", "7"],
+    "commas": ["10,0 S", "10,0 P", "0,0 P", "2,5 S", "7"],
+}
+
+
+@pytest.mark.parametrize("cells_of", SIDED.values(), ids=SIDED)
+def test_a_rudder_to_starboard_is_positive(tmp_path, cells_of):
+    table = frame().assign(a=np.resize(np.array(cells_of, object), 50))
+    table.to_csv(tmp_path / "x.csv", index=False, sep=";")
+    found, made = read(tmp_path / "x.csv")
+    np.testing.assert_array_equal(found["a"][:5], [10, -10, 0, 2.5, 7])
+    assert "column 'a' names sides: starboard is positive, port negative" in made.notes
+
+
+def test_what_names_no_side_is_told(tmp_path):
+    table = frame().assign(a=["10.0 S", "10.0 P"] * 25)
+    # a side and a sign contradict each other
+    table.loc[3:5, "a"] = ["10.0 X", "S 10 P", "-10.0 S"]
+    table.to_csv(tmp_path / "x.csv", index=False)
+    found, made = read(tmp_path / "x.csv")
+    assert "column 'a' holds words in 3 rows: read as missing" in made.notes
+    assert found["a"].isna().sum() == 3
+
+
+@pytest.mark.parametrize(("name", "taken"), [("Rudder", True), ("Latitude", False)])
+def test_one_side_alone_is_one_in_the_column_of_a_rudder(tmp_path, name, taken):
+    frame().assign(**{name: "33.9 S"}).to_csv(tmp_path / "x.csv", index=False)
+    assert (name in open_csv(tmp_path / "x.csv").sides) == taken
+
+
 @pytest.mark.parametrize(
     ("text", "read"),
     [("2026-06-02 09:30:{:02}", "dates"), ("09:30:{:02}", "times of day")],

@@ -28,7 +28,12 @@ _THOUSANDS = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
 _DATE = re.compile(r"\d{4}([-/])\d\d\1\d\d[T ]\d\d:\d\d|\d\d\.\d\d\.\d{4}[T ]\d\d:\d\d")
 # behind the seconds of a time of day
 _FRACTION = r":\d\d[.,](\d+)"
-_CLOCK = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?")
+_CLOCK = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?(\s*[AaPp]\.?[Mm]\.?)?")
+_HALF = r"\s*([AaPp])\.?[Mm]\.?$"
+# 10.0 S, S10: an angle without a sign, and the side that it is to
+_SIDE = r"(starboard|stbd|s|port|p)?"
+_SIDED = re.compile(rf"{_SIDE}[ :]*(\d[\d.,]*|[.,]\d+)[ °]*(?:deg)?[ :]*{_SIDE}", re.IGNORECASE)
+_RUDDER = re.compile("rud|helm|steer|wheel", re.IGNORECASE)
 # RE2, on bytes
 _GROUPED = r"^\s*[-+]?(\d{1,3}(\.\d{3})*|\d+)(,\d+)?\s*$"
 _PLAIN = r"^-?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
@@ -68,15 +73,33 @@ def has_comma(cell: str) -> bool:
     return bool(_COMMA.fullmatch(bare) or _THOUSANDS.fullmatch(bare))
 
 
-def kind(cells: Iterable[str], *, comma: bool) -> str:
-    """Return what most cells of a column hold: number, date, clock or text."""
+def _to_starboard(cell: str) -> str | None:
+    """Return an angle to a side as a number, negative to port; None where a cell is none."""
+    found = _SIDED.fullmatch(cell.strip())
+    if found is None or bool(found[1]) == bool(found[3]):
+        return None
+    return ("-" if (found[1] or found[3])[0] in "pP" else "") + found[2]
+
+
+def sided(column: Any) -> Any:
+    """Return a column of angles to a side as text of numbers, negative to port."""
+    import pyarrow as pa
+
+    return pa.array([_to_starboard(c) or c or None for c in text(column)], pa.string())
+
+
+def kind(cells: Iterable[str], *, comma: bool, name: str = "") -> str:
+    """Return what most cells of a column hold: number, date, clock, side or text."""
     filled = [c.strip() for c in cells]
     filled = [c for c in filled if c.lower() not in _NOTHING]
-    for name, test in (("date", is_date), ("clock", is_clock)):
+    for what, test in (("date", is_date), ("clock", is_clock)):
         if filled and sum(map(test, filled)) > 0.5 * len(filled):
-            return name
+            return what
     if filled and sum(is_number(c, comma=comma) for c in filled) < 0.5 * len(filled):
-        return "text"
+        sides = [s for s in map(_to_starboard, filled) if s]
+        # S alone may be the south of a latitude
+        known = bool(_RUDDER.search(name)) or any(s.startswith("-") for s in sides)
+        return "side" if known and len(sides) > 0.5 * len(filled) else "text"
     return "number"
 
 
@@ -186,9 +209,10 @@ def dates(column: Any) -> NDArray[np.float64]:
     words = words.str.replace(r"^(\d\d)\.(\d\d)\.(\d{4})", r"\3-\2-\1", regex=True)
     words = words.str.replace(r"^(\d{4})/(\d\d)/", r"\1-\2-", regex=True)
     words = words.str.replace(",", ".", regex=False)
+    words, later = _without_halves(words)
     parsed = pd.to_datetime(words, utc=True, errors="coerce", format="ISO8601")
     ns = parsed.astype("datetime64[ns, UTC]").astype("int64").to_numpy().astype(float)
-    return np.where(parsed.isna().to_numpy(), np.nan, ns * 1e-9)
+    return np.where(parsed.isna().to_numpy(), np.nan, ns * 1e-9 + later)
 
 
 def unix_seconds(stamps: Any) -> NDArray[np.float64]:
@@ -282,9 +306,21 @@ def times_of_day(column: Any) -> NDArray[np.float64]:
     import pandas as pd
 
     words = pd.Series(text(column)).str.strip().str.replace(",", ".", regex=False)
+    words, later = _without_halves(words)
     parts = words.str.extract(r"^(\d\d?):(\d\d):(\d\d(?:\.\d+)?)$").astype(float).to_numpy()
-    value: NDArray[np.float64] = parts @ np.array([3600.0, 60.0, 1.0])
+    value: NDArray[np.float64] = parts @ np.array([3600.0, 60.0, 1.0]) + later
     return value
+
+
+def _without_halves(words: Any) -> tuple[Any, NDArray[np.float64]]:
+    """Return times without AM or PM, and the seconds that these stand for, NaN beside 13 h."""
+    half = words.str.extract(_HALF)[0].str.lower()
+    if half.isna().all():
+        return words, np.zeros(len(words))
+    hour = words.str.extract(r"(\d\d?):\d\d")[0].astype(float)
+    later = DAY / 2 * (1.0 * ((half == "p") & (hour < 12)) - ((half == "a") & (hour == 12)))
+    wrong = half.notna() & ~hour.between(1, 12)
+    return words.str.replace(_HALF, "", regex=True), later.mask(wrong).to_numpy(float)
 
 
 class DayClock:

@@ -11,6 +11,8 @@ from io import RawIOBase
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from greybox.errors import LogError
 from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.layout import Layout, find_layout
@@ -123,8 +125,9 @@ class CsvFile(Layout):
         for step in self.steps:
             self._note(f"{step.source[0]}: {step.sentence}")
         for name, lost in words.items():
+            what = "what is no time" if name in stamps else "words"
             self._note(
-                f"column '{name}' holds words in {lost} row{'s' if lost > 1 else ''}: "
+                f"column '{name}' holds {what} in {lost} row{'s' if lost > 1 else ''}: "
                 f"read as missing"
             )
 
@@ -139,7 +142,12 @@ class CsvFile(Layout):
         if name in self.text:
             return cell_text.text(column)
         if name in stamps:
-            return stamps[name].seconds(column)
+            seconds = stamps[name].seconds(column)
+            if lost := int(np.isnan(seconds).sum()) - column.null_count:
+                words[name] += lost
+            return seconds
+        if name in self.sides:
+            column = cell_text.sided(column)
         return cell_text.numbers(self._without_groups(column, name), self.decimal, name, words)
 
     def _without_groups(self, column: Any, name: str) -> Any:

@@ -41,8 +41,8 @@ class Layout:
         Lines before the first row.
     units : dict of str to str
         Where a line of units stands below the names.
-    text, dates, clocks : frozenset of str
-        Columns of words, of dates and of times of day.
+    text, dates, clocks, sides : frozenset of str
+        Columns of words, of dates, of times of day and of angles to port or starboard.
     notes : list of str
         What was recovered.
     """
@@ -56,6 +56,7 @@ class Layout:
     text: frozenset[str]
     dates: frozenset[str]
     clocks: frozenset[str]
+    sides: frozenset[str]
     notes: list[str]
 
 
@@ -164,16 +165,17 @@ def find_layout(path: Path) -> Layout:
     if encoding != "utf-8":
         notes.append(f"text in {encoding}")
     kinds = {
-        name: cells.kind((row[k] for row in data), comma=split.delimiter != ",")
+        name: cells.kind((row[k] for row in data), comma=split.delimiter != ",", name=name)
         for k, name in enumerate(columns)
     }
-    text, dates, clocks = (
+    text, dates, clocks, sides = (
         frozenset(n for n, kind in kinds.items() if kind == wanted)
-        for wanted in ("text", "date", "clock")
+        for wanted in ("text", "date", "clock", "side")
     )
+    notes += [f"column '{n}' names sides: starboard is positive, port negative" for n in sides]
     skip = at[split.first_row]
     return Layout(
-        columns, split.delimiter, decimal, encoding, skip, units, text, dates, clocks, notes
+        columns, split.delimiter, decimal, encoding, skip, units, text, dates, clocks, sides, notes
     )
 
 
