@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -129,9 +130,13 @@ def missing_figure(finding: Finding, recording: Recording) -> Figure:
     """Draw a signal with the stretches that hold no number, and a close-up of the longest."""
     t: Array = finding.picture["t"]
     bad: NDArray[np.bool_] = finding.picture["bad"]
-    timed = np.isfinite(t)
-    t, bad = t[timed], bad[timed]
     s = _telling(recording, finding.channels)
+    timed, along = np.isfinite(t), "time [s]"
+    if not (bad & timed).any():
+        # rows that have no time either stand by their number
+        along, t, timed = "row of the file", np.arange(1.0, len(t) + 1), np.ones(len(t), bool)
+        s = replace(s, t=t)
+    t, bad = t[timed], bad[timed]
     good_t, value = _orderly(s)
     period = clock(np.unique(t)).period if len(t) > 1 else 1.0
     # a lone missing sample is as wide as its step
@@ -150,7 +155,7 @@ def missing_figure(finding: Finding, recording: Recording) -> Figure:
         _shade(zoom, inside, "")
         count = max(b - a for a, b in found)
         zoom.set_title(f"the longest: {count} sample{'s' * (count > 1)}", fontsize=9)
-    _name(s, whole, zoom)
+    _name(s, whole, zoom, along=along)
     return figure
 
 
@@ -463,10 +468,10 @@ def _circle(ax: Any, t: Array, value: Array, label: str = "", size: float = 7) -
     )  # fmt: skip
 
 
-def _name(of: Signal | Finding, *axes: Any) -> None:
+def _name(of: Signal | Finding, *axes: Any, along: str = "time [s]") -> None:
     name = of.name if isinstance(of, Signal) else of.channel
     for ax in axes:
-        label_axes(ax, "time [s]", label_of(name, of.unit))
+        label_axes(ax, along, label_of(name, of.unit))
 
 
 def _telling(recording: Recording, names: Sequence[str]) -> Signal:

@@ -226,8 +226,12 @@ del { background: #f9ddcc; }
   figure { break-inside: avoid; }
   .pictures { grid-template-columns: 1fr 1fr; } h2, h3 { break-after: avoid; }
   .wide { overflow: visible; } th, td { white-space: normal; padding: 0.2rem 0.3rem; }
-  td:first-child { max-width: 10rem; overflow-wrap: anywhere; min-width: 4rem; }
-  tr, li { break-inside: avoid; } pre { white-space: pre-wrap; } }
+  td:first-child { max-width: 16rem; overflow-wrap: anywhere; min-width: 4rem; }
+  .sentences td:first-child { max-width: none; width: 22%; min-width: 9rem; }
+  tr, li { break-inside: avoid; }
+  caption, thead, tr:nth-child(-n+2) { break-after: avoid; } tr:last-child { break-after: auto; }
+  tr:nth-last-child(-n+2):not(:first-child) { break-before: avoid; }
+  pre { white-space: pre-wrap; } }
 </style>
 </head>
 <body>

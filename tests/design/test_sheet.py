@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browser import require_legible, without_scripts
+from browser import driven, require_legible, without_scripts
 from designs import prior_model, random_plan
 from matplotlib import image
 
@@ -378,6 +378,18 @@ def test_in_a_browser(unsure, page, tmp_path):
     printed = tmp_path / "printed.pdf"
     chromium("--no-pdf-header-footer", f"--print-to-pdf={printed}", f"file://{tmp_path}/sheet.html")
     assert len(re.findall(rb"/Type\s*/Page\b", printed.read_bytes())) == 1
+
+
+def test_the_printed_box_of_limits_has_all_its_sides(short, tmp_path):
+    write_sheet(short, tmp_path / "sheet.html")
+    with driven(tmp_path / "sheet.html") as browser:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+        right, width = browser.execute_script(
+            "return ['.abort', 'body'].map("
+            "e => document.querySelector(e).getBoundingClientRect().right)"
+        )
+        # what lies on the edge of the paper's content is cut off
+        assert right < width - 1
 
 
 def test_what_to_do_after_a_plan_follows_its_purpose(short):

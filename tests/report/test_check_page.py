@@ -120,6 +120,8 @@ def row_case(name):
     elif name == "nan":
         c["u"][100:140] = np.nan
         c["x_n"][[300, 301, n - 1]] = np.nan
+    elif name == "empty rows":
+        c = {k: np.r_[v, np.full(60, np.nan)] for k, v in c.items()}
     elif name == "outlier":
         c["v"][[50, 200, 201]] += [2, -3, -3]
     elif name == "stuck":
@@ -140,12 +142,14 @@ def row_case(name):
     recording = as_recording(c)
     make = {
         "gap": time_findings, "duplicate_time": time_findings, "nan": missing_findings,
+        "empty rows": missing_findings,
         "outlier": spike_findings, "stuck": stuck_findings,
         "quantised": coarse_findings, "unit": lambda r: angle_unit_findings(r, SHIP),
         "heading_wrap": wrap_findings, "position_hold": hold_findings,
         "position_jump": jump_findings,
     }  # fmt: skip
-    return report_of([f for f in make[name](recording) if f.id == name], recording)
+    of = {"empty rows": "nan"}.get(name, name)
+    return report_of([f for f in make[name](recording) if f.id == of], recording)
 
 
 def answer_case(name):
@@ -174,8 +178,8 @@ def answer_case(name):
 TIES = ("clock of u, v", "clock of psi", "clock of r", "lever arm", "heading bias")
 READINGS = ("speeds in knots", "velocities north and east", "rate reversed", "heading reversed")
 ROWS = (
-    "gap", "duplicate_time", "nan", "outlier", "stuck", "quantised", "unit", "heading_wrap",
-    "position_hold", "position_jump",
+    "gap", "duplicate_time", "nan", "empty rows", "outlier", "stuck", "quantised", "unit",
+    "heading_wrap", "position_hold", "position_jump",
 )  # fmt: skip
 ANSWERS = ("course", "thruster", "wind sign", "wind frame")
 

@@ -135,3 +135,25 @@ def test_a_long_name_leaves_the_numbers_beside_it_room(tmp_path):
             )
             assert page <= width
             assert max(first, second) < 0.6 * box
+
+
+@needs_browser
+def test_a_printed_table_breaks_neither_its_words_nor_behind_its_head(tmp_path):
+    rows = [["duplicate_time", "clean", "nothing found " * 12], ["external_force", "clean", ""]]
+    made = [Table("All checks", ["check", "outcome", "what was seen"], rows, sentences=True)]
+    path = tmp_path / "page.html"
+    write_page(Page("Title", "Headline", tables=made), path)
+    with driven(path) as browser:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+        browser.execute_cdp_cmd(
+            "Emulation.setDeviceMetricsOverride",
+            {"width": 680, "height": 800, "deviceScaleFactor": 1, "mobile": False},
+        )
+        lines, kept = browser.execute_script(
+            "const text = document.createRange(); const t = document.querySelector('.wide table');"
+            "text.selectNodeContents(t.querySelector('td'));"
+            "return [text.getClientRects().length, [t.caption, t.tHead, t.rows[1]].map("
+            "e => getComputedStyle(e).breakAfter)]"
+        )
+        assert lines == 1
+        assert kept == ["avoid"] * 3
