@@ -141,6 +141,9 @@ def test_every_command_is_described():
     everything = "".join(p.read_text(encoding="utf-8") for p in DOCS.rglob("*.md"))
     missing = [c for c in commands.choices if f"greybox {c}" not in everything]
     assert not missing
+    # predict and export stand beside what their models are for
+    pages = {p.stem for f in (DOCS, DOCS / "howto") for p in f.glob("*.md")}
+    assert commands.choices.keys() - pages == {"help"}
 
 
 def test_every_finding_has_its_picture():
