@@ -22,6 +22,7 @@ from experiment_design.optimise.search import (
     draw_two_level,
     exchange,
     limit_scale,
+    recombine,
 )
 from experiment_design.request.problem import TrialProblem
 from experiment_design.request.request import PreparedRequest, build_problem
@@ -170,9 +171,9 @@ def search_campaign(
 ) -> Found:
     """Search for the sequences of all trials.
 
-    One trial: four chains of iterated local search in rounds, the best
-    design so far handed to the weakest chain. Several: one trial after another
-    with the others' information known, twice around.
+    One trial: four chains of iterated local search in rounds, after each of which stretches of
+    their designs are put together and the best so far is handed to the weakest chain. Several:
+    one trial after another with the others' information known, twice around.
 
     Parameters
     ----------
@@ -231,6 +232,11 @@ def search_campaign(
                         "trial %d, round %d of %d: %d starts, %d evaluations, criterion %.6g",
                         t + 1, round_ + 1, rounds, len(chains), spent, best[t].value,
                     )  # fmt: skip
+                    if not quick:
+                        crossed = recombine(here, found, rng)
+                        spent += crossed.evaluations
+                        best[t] = crossed if crossed.beats(best[t], scale) else best[t]
+                        _log.info("their stretches put together: criterion %.6g", best[t].value)
                     weakest = 0
                     for i, candidate in enumerate(found):
                         if found[weakest].beats(candidate, scale):

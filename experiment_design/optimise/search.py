@@ -32,6 +32,10 @@ _ITERATIONS = 150
 _LIMITED_ITERATIONS = 50
 # a criterion a parameter that is gained for each scaled unit of a limit, at first
 _PENALTY = 3.0
+# most sequences put together from others at a time, how many of them are climbed from and by how
+# many evaluations of the gradient, and how often this is done while it gains this much
+_SPLICES, _CLIMBED, _ASCENT = 1000, 3, 100
+_CROSSINGS, _ENOUGH = 4, 1e-3
 
 
 @dataclass(frozen=True)
@@ -239,6 +243,51 @@ def exchange(problem: TrialProblem, unit: Array, passes: int) -> Candidate:
         if best is before:
             break
     return Candidate(best.unit, best.value, best.missed, spent)
+
+
+def recombine(problem: TrialProblem, found: list[Candidate], rng: np.random.Generator) -> Candidate:
+    """Return what grows from stretches of one sequence put into another (two-point crossover).
+
+    Local maxima differ in a few stretches, each of which is better in one of them than in the
+    others: ascents leave them where they are.
+    """
+    scale = limit_scale(problem)
+    best = found[0]
+    for candidate in found[1:]:
+        best = candidate if candidate.beats(best, scale) else best
+    holds = len(best.unit)
+    pool, spent = list(found), 0
+    for _ in range(_CROSSINGS if min(holds, len(found)) > 1 else 0):
+        into = rng.integers(len(pool), size=_SPLICES)
+        of = (into + rng.integers(1, len(pool), size=_SPLICES)) % len(pool)
+        first, last = np.sort(rng.integers(holds + 1, size=(2, _SPLICES)), axis=0)
+        units, hold = np.array([c.unit for c in pool]), np.arange(holds)
+        taken = (hold >= first[:, None]) & (hold < last[:, None])
+        spliced = np.where(taken[..., None], units[of], units[into])
+        if problem.schedule.limited:
+            spliced = within_reach(problem, spliced)
+        result = problem.evaluate(spliced)
+        spent += len(spliced)
+        kept = (result.missed <= TOLERANCE).all(axis=0)
+        value = np.where(kept & np.isfinite(result.value), result.value, -np.inf)
+        before = best
+        for value_, i in _distinct(value, _CLIMBED):
+            if value_ == -np.inf:
+                break
+            candidate = ascend(problem, spliced[i], _ASCENT)
+            spent += candidate.evaluations
+            pool.append(candidate)
+            best = candidate if candidate.beats(best, scale) else best
+        if best is before or best.value - before.value < _ENOUGH:
+            break
+        pool = sorted(pool, key=lambda c: -c.value if c.feasible else np.inf)[: len(found)]
+    return Candidate(best.unit, best.value, best.missed, spent)
+
+
+def _distinct(value: Array, count: int) -> list[tuple[float, int]]:
+    """Return the largest values (n,) that differ, at most `count`, with their places."""
+    _, first = np.unique(np.round(value, 6), return_index=True)
+    return [(float(value[i]), int(i)) for i in first[::-1][:count]]
 
 
 def perturb(unit: Array, rng: np.random.Generator) -> Array:

@@ -24,7 +24,7 @@ from experiment_design.design import design_trial
 from experiment_design.excitation.rollout import Rollout
 from experiment_design.excitation.schedule import make_schedule
 from experiment_design.information.moments import MomentProgram, Moments
-from experiment_design.optimise.search import ascend, climb, draw_two_level
+from experiment_design.optimise.search import ascend, assess, climb, draw_two_level, recombine
 from experiment_design.request.problem import Scenario, TrialProblem
 from greybox.model.catalogue import get_structure
 from greybox.model.noise import NoiseLevels
@@ -97,6 +97,19 @@ def test_no_short_trial_in_three_degrees_beats_its_bound(ship, name, holds):
     assert found.kind is not Kind.NOT_AVAILABLE
     assert not found.rigorous
     assert found.bound >= best
+
+
+def test_what_is_good_in_each_of_two_sequences_is_put_together(ship):
+    problem = make_problem(ship, "surge", 120.0)
+    whole = climb(problem, draw_two_level(problem, np.random.default_rng(0), 2), 0, 200)
+    poor = draw_two_level(problem, np.random.default_rng(1), 1)[0]
+    halves = whole.unit.copy(), whole.unit.copy()
+    halves[0][:6], halves[1][6:] = poor[:6], poor[6:]
+    found = assess(problem, np.array(halves))
+    assert max(c.value for c in found) < whole.value - 0.05
+    best = recombine(problem, found, np.random.default_rng(0))
+    assert best.feasible
+    assert best.value >= whole.value - 1e-6
 
 
 @pytest.mark.long
