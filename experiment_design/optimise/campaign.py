@@ -233,7 +233,7 @@ def search_campaign(
                         t + 1, round_ + 1, rounds, len(chains), spent, best[t].value,
                     )  # fmt: skip
                     if not quick:
-                        crossed = recombine(here, found, rng)
+                        crossed = recombine(here, found, rng, budget)
                         spent += crossed.evaluations
                         best[t] = crossed if crossed.beats(best[t], scale) else best[t]
                         _log.info("their stretches put together: criterion %.6g", best[t].value)

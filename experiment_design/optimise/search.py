@@ -245,18 +245,29 @@ def exchange(problem: TrialProblem, unit: Array, passes: int) -> Candidate:
     return Candidate(best.unit, best.value, best.missed, spent)
 
 
-def recombine(problem: TrialProblem, found: list[Candidate], rng: np.random.Generator) -> Candidate:
+def recombine(
+    problem: TrialProblem, found: list[Candidate], rng: np.random.Generator, budget: int
+) -> Candidate:
     """Return what grows from stretches of one sequence put into another (two-point crossover).
 
     Local maxima differ in a few stretches, each of which is better in one of them than in the
     others: ascents leave them where they are.
+
+    Parameters
+    ----------
+    problem : TrialProblem
+    found : list of Candidate
+        At least one; one alone is given back.
+    rng : Generator
+    budget : int
+        Evaluations of the gradient to spend.
     """
     scale = limit_scale(problem)
     best = found[0]
     for candidate in found[1:]:
         best = candidate if candidate.beats(best, scale) else best
     holds = len(best.unit)
-    pool, spent = list(found), 0
+    pool, spent, climbed = list(found), 0, 0
     for _ in range(_CROSSINGS if min(holds, len(found)) > 1 else 0):
         into = rng.integers(len(pool), size=_SPLICES)
         of = (into + rng.integers(1, len(pool), size=_SPLICES)) % len(pool)
@@ -272,16 +283,16 @@ def recombine(problem: TrialProblem, found: list[Candidate], rng: np.random.Gene
         value = np.where(kept & np.isfinite(result.value), result.value, -np.inf)
         before = best
         for value_, i in _distinct(value, _CLIMBED):
-            if value_ == -np.inf:
+            if value_ == -np.inf or climbed >= budget:
                 break
-            candidate = ascend(problem, spliced[i], _ASCENT)
-            spent += candidate.evaluations
+            candidate = ascend(problem, spliced[i], min(_ASCENT, budget))
+            climbed += candidate.evaluations
             pool.append(candidate)
             best = candidate if candidate.beats(best, scale) else best
         if best is before or best.value - before.value < _ENOUGH:
             break
         pool = sorted(pool, key=lambda c: -c.value if c.feasible else np.inf)[: len(found)]
-    return Candidate(best.unit, best.value, best.missed, spent)
+    return Candidate(best.unit, best.value, best.missed, spent + climbed)
 
 
 def _distinct(value: Array, count: int) -> list[tuple[float, int]]:

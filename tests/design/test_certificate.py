@@ -107,7 +107,7 @@ def test_what_is_good_in_each_of_two_sequences_is_put_together(ship):
     halves[0][:6], halves[1][6:] = poor[:6], poor[6:]
     found = assess(problem, np.array(halves))
     assert max(c.value for c in found) < whole.value - 0.05
-    best = recombine(problem, found, np.random.default_rng(0))
+    best = recombine(problem, found, np.random.default_rng(0), 200)
     assert best.feasible
     assert best.value >= whole.value - 1e-6
 
