@@ -282,8 +282,9 @@ def recombine(
         kept = (result.missed <= TOLERANCE).all(axis=0)
         value = np.where(kept & np.isfinite(result.value), result.value, -np.inf)
         before = best
-        for value_, i in _distinct(value, _CLIMBED):
-            if value_ == -np.inf or climbed >= budget:
+        _, each = np.unique(value.round(6), return_index=True)
+        for i in each[::-1][:_CLIMBED]:
+            if not np.isfinite(value[i]) or climbed >= budget:
                 break
             candidate = ascend(problem, spliced[i], min(_ASCENT, budget))
             climbed += candidate.evaluations
@@ -293,12 +294,6 @@ def recombine(
             break
         pool = sorted(pool, key=lambda c: -c.value if c.feasible else np.inf)[: len(found)]
     return Candidate(best.unit, best.value, best.missed, spent + climbed)
-
-
-def _distinct(value: Array, count: int) -> list[tuple[float, int]]:
-    """Return the largest values (n,) that differ, at most `count`, with their places."""
-    _, first = np.unique(np.round(value, 6), return_index=True)
-    return [(float(value[i]), int(i)) for i in first[::-1][:count]]
 
 
 def perturb(unit: Array, rng: np.random.Generator) -> Array:

@@ -172,7 +172,11 @@ def find_layout(path: Path) -> Layout:
         frozenset(n for n, kind in kinds.items() if kind == wanted)
         for wanted in ("text", "date", "clock", "side")
     )
-    notes += [f"column '{n}' names sides: starboard is positive, port negative" for n in sides]
+    notes += [
+        f"column '{n}' names sides: starboard is positive, port negative"
+        for n in kinds
+        if n in sides
+    ]
     skip = at[split.first_row]
     return Layout(
         columns, split.delimiter, decimal, encoding, skip, units, text, dates, clocks, sides, notes
