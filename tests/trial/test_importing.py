@@ -22,6 +22,7 @@ from greybox.trial.convert.read import read_segments
 from greybox.trial.import_files import import_files
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.steps import Step
+from greybox.units import UNITS
 from greybox.vessel.toml import load_vessel, vessel_from_dict
 
 VESSEL = load_vessel("thesis")
@@ -394,6 +395,62 @@ def test_columns_n_and_e_of_a_file_of_any_size(tmp_path, monkeypatch, cells, hel
     monkeypatch.setattr(stream, "_LARGE_CELLS", cells)
     import_files([tmp_path / "raw.csv"], vessel, tmp_path / "log.csv")
     assert ("x_n" in pd.read_csv(tmp_path / "log.csv")) is not held
+
+
+@pytest.mark.parametrize("cells", [20_000_000, 0])
+@pytest.mark.parametrize("place", ["degrees", "metres", "none"])
+@pytest.mark.parametrize("unit", ["m/s", "kn", "km/h"])
+def test_a_speed_over_ground_without_a_unit_goes_as_far_as_the_positions(
+    tmp_path, monkeypatch, limited, unit, place, cells
+):
+    rng = np.random.default_rng(1)
+    t = np.arange(900.0)
+    course, speed = 2.0 * np.sin(t / 60), 3.0 + np.cos(t / 40)
+    # at rest before the trial
+    speed[:150] = 0.0
+    north, east = (np.cumsum(speed * f(course)) + rng.normal(0, 0.5, 900) for f in (np.cos, np.sin))
+    metres = {"Northing": north, "Easting": east}
+    degrees = {"Latitude": 57 + north / 111_400, "Longitude": 11 + east / 60_800}
+    table = {
+        "Time": t, **{"metres": metres, "degrees": degrees, "none": {}}[place],
+        "HDG_TRUE": np.degrees(course) % 360, "SOG": speed / UNITS[unit].factor,
+        "COG": np.degrees(course) % 360, "rpm": 100 + 0 * t,
+    }  # fmt: skip
+    pd.DataFrame(table).to_csv(tmp_path / "raw.csv", index=False)
+    vessel = vessel_from_dict(
+        {"name": "S", "length": 30, "thruster": [{"type": "fixed", "speed": "rpm"}]}
+    )
+    monkeypatch.setattr(stream, "_LARGE_CELLS", cells)
+    monkeypatch.setattr(stream, "_BLOCK_ROWS", 300)
+    limited(block_bytes=1 << 13, block_rows=100)
+    text = import_files([tmp_path / "raw.csv"], vessel, tmp_path / "log.csv")
+    told = "m/s" if place == "none" else unit
+    why = (
+        ", no unit being stated"
+        if told == "m/s"
+        else ", since so it goes as far as the positions do"
+    )
+    assert f"note: SOG taken for sog in {told}{why}" in text
+    log = pd.read_csv(tmp_path / "log.csv")
+    factor = 1.0 if told == unit else 1 / UNITS[unit].factor
+    np.testing.assert_allclose(log["u"].max(), 4.0 * factor, rtol=1e-3)
+
+
+@pytest.mark.parametrize("cells", [20_000_000, 0])
+@pytest.mark.parametrize("named", ["SOG [kn]", "SOG"])
+def test_a_stated_unit_of_the_speed_over_ground_is_believed(tmp_path, monkeypatch, named, cells):
+    t = np.arange(200.0)
+    # a tenth of the way that the speed makes: no unit fits, and none is looked for
+    table = {"t": t, "north": 0.2 * t, "east": 0 * t, "psi": 0 * t, named: 4 + 0 * t, "cog": 0 * t}
+    pd.DataFrame(table | {"rpm": 100 + 0 * t}).to_csv(tmp_path / "raw.csv", index=False)
+    columns = {} if named == "SOG [kn]" else {"SOG": {"name": "sog", "unit": "kn"}}
+    vessel = vessel_from_dict(
+        {"name": "S", "length": 30, "thruster": [{"type": "fixed", "speed": "rpm"}]}
+        | {"columns": columns}
+    )
+    monkeypatch.setattr(stream, "_LARGE_CELLS", cells)
+    import_files([tmp_path / "raw.csv"], vessel, tmp_path / "log.csv")
+    np.testing.assert_allclose(pd.read_csv(tmp_path / "log.csv")["u"], 4 * UNITS["kn"].factor)
 
 
 @pytest.mark.parametrize("cells", [20_000_000, 0])

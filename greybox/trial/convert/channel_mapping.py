@@ -20,11 +20,14 @@ from greybox.trial.convert.derived_signals import (
     EARTH,
     MOTION_SIGNALS,
     PLACE,
+    local_positions,
+    places,
     usual_reach,
     wraps_by_degrees,
 )
 from greybox.trial.convert.merge import merge, on_one_clock
 from greybox.trial.convert.settle_axes import settle_axes
+from greybox.trial.convert.speed_unit import unit_of_speed
 from greybox.trial.convert.time_scale import TimeScale, time_scale
 from greybox.trial.log import Provenance
 from greybox.trial.raw_log import Array, Recording, Signal, SourceFile, shortened
@@ -342,13 +345,15 @@ def canonical(
     assigned: dict[str, Assigned],
     vessel: Vessel,
     reach: Mapping[str, tuple[float, float]] | None = None,
+    speed: str | None = None,
 ) -> Recording:
     """Rename and convert the signals of a recording; state every guess.
 
-    `reach` gives largest value and step of angles whose unit is to be guessed,
-    where the recording is only a part of what there is.
+    `reach` gives largest value and step of angles, and `speed` the unit of the speed over
+    ground, whose unit is to be guessed, where the recording is only a part of what there is.
     """
     by_name = {s.name: s for s in raw.signals}
+    speed = speed or speed_unit(raw, assigned, vessel)
     signals, notes = [], []
     for name, a in assigned.items():
         signal = by_name.get(a.raw)
@@ -357,6 +362,9 @@ def canonical(
         if a.how != "guessed" and signal.unit is not None and a.how != "mapped":
             a = replace(a, unit=signal.unit)
         unit, factor, why = _factor(a, signal, vessel, (reach or {}).get(name))
+        if name == "sog" and speed and speed != unit and _unstated(a, signal):
+            unit, factor = speed, unit_factor(speed, "m/s", a.raw)
+            why = ", since so it goes as far as the positions do"
         if a.how == "guessed":
             size = f" in {unit}" if unit else ""
             notes.append(f"{a.raw} taken for {name}{size}{why}")
@@ -387,6 +395,31 @@ def _factor(
             return "deg", np.pi / 180, f", since it reaches {reach[0]:.0f}"
         return "rad", 1.0, f", since it stays below {reach[0]:.2f}"
     return target, 1.0, ", no unit being stated"
+
+
+def speed_unit(raw: Recording, assigned: Mapping[str, Assigned], vessel: Vessel) -> str | None:
+    """Return the unit of a speed over ground that states none, where the positions tell it."""
+    by_name = {s.name: s for s in raw.signals}
+    a = assigned.get("sog")
+    if a is None or not _unstated(a, by_name.get(a.raw)):
+        return None
+    pair = next((p for p in (PLACE, ("lat", "lon")) if assigned.keys() >= set(p)), None)
+    if pair is None or any(assigned[n].raw not in by_name for n in pair):
+        return None
+    place = [(assigned[n], by_name[assigned[n].raw]) for n in pair]
+    north, east = (replace(s, value=s.value * _factor(a, s, vessel)[1]) for a, s in place)
+    if len(north) != len(east):
+        return None
+    if pair != PLACE:
+        if not np.isfinite(places(north, east)[1]).any():
+            return None
+        north, east, _ = local_positions(north, east)
+    return unit_of_speed(by_name[a.raw], north, east)
+
+
+def _unstated(a: Assigned, signal: Signal | None) -> bool:
+    """Whether nothing states the unit of a signal, not even a canonical name."""
+    return signal is not None and signal.unit is None and a.unit is None and a.how != "exact"
 
 
 def angle_reach(value: Array) -> tuple[float, float]:

@@ -24,6 +24,7 @@ from greybox.trial.convert.channel_mapping import (
     batch_recording,
     canonical,
     reading_steps,
+    speed_unit,
     table_columns,
     unused_mappings,
     without_false_positions,
@@ -125,7 +126,10 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
             f"sort it, or cut it where time goes back."
         )
     units = {n: angle_unit(reach) for n, reach in found.reach.items()}
-    whole = canonical(found.sample, assigned, vessel, found.reach)
+    speed = found.speed or "m/s"
+    if "sog" in assigned and assigned["sog"].unit is None:
+        units["sog"] = speed
+    whole = canonical(found.sample, assigned, vessel, found.reach, speed)
     derived = derive_signals(whole, found.origin)
     steps = (*before.steps, *reading_steps(table, found.scale))
     decided = {n: replace(a, unit=units[n]) if n in units else a for n, a in assigned.items()}
@@ -210,6 +214,7 @@ class _Found:
         self.newest = -np.inf
         self.parts: dict[str, _Parts] = {}
         self.reach: dict[str, tuple[float, float]] = {}
+        self.speed: str | None = None
         self.raw = self.sample = Recording("", ())
 
     def add(self, batch: Batch) -> None:
@@ -225,7 +230,8 @@ class _Found:
         good = np.isfinite(t)
         self._order(t[good])
         self._reach(raw)
-        recording = canonical(raw, self.assigned, self.vessel)
+        self.speed = self.speed or speed_unit(raw, self.assigned, self.vessel)
+        recording = canonical(raw, self.assigned, self.vessel, speed=self.speed or "m/s")
         if not self.sample.signals:
             self.sample, self.raw = _head(raw, _SAMPLE_ROWS), recording
         if self.origin is None:
