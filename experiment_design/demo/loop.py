@@ -17,7 +17,7 @@ from experiment_design.request.request import DesignRequest
 from greybox.channels import MOTION_WORDS
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.gain import gains
-from greybox.diagnosis.result import Diagnosis, Found
+from greybox.diagnosis.result import Diagnosis, Found, Gain
 from greybox.errors import UsageError, suggestion
 from greybox.estimation.result import Estimate
 from greybox.files import make_folder
@@ -136,7 +136,11 @@ def run_demo(
 
     better = load_model(files.better)
     after = _run_on(files.other, {"model": model, "better": better})
-    done(_gained(after, better.sample_time, seed))
+    run, mended = after.runs
+    gain = {
+        s: g for s, g in gains(run, mended, better.sample_time, seed).items() if s in MOTION_WORDS
+    }
+    done(_gained(gain))
 
     progress("designing the next trial")
     asked = _asked(_NEXT_SECONDS, seed, prior=better)
@@ -145,7 +149,7 @@ def run_demo(
     done(_designed_next(next_design, better))
     return Demo(
         files, tuple(steps), design, next_design, trial, other, sailed.truth, check, estimate,
-        before, after, diagnosis,
+        before, after, gain, diagnosis,
     )  # fmt: skip
 
 
@@ -283,13 +287,11 @@ def _diagnosed(diagnosis: Diagnosis, hidden: Sequence[Effect]) -> Step:
     )
 
 
-def _gained(compared: Comparison, sample_time: float, seed: int) -> Step:
-    before, after = compared.runs
+def _gained(gain: Mapping[str, Gain]) -> Step:
     told = [
         f"{MOTION_WORDS[s]} from {g.before:.1f} to {g.after:.1f} % (95 % interval of the gain "
         f"{g.ci[0]:.1f} to {g.ci[1]:.1f})"
-        for s, g in gains(before, after, sample_time, seed).items()
-        if s in MOTION_WORDS
+        for s, g in gain.items()
     ]
     return Step(
         "Measure the gain",

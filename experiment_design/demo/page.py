@@ -14,7 +14,7 @@ from greybox.model.model import ManoeuvringModel
 from greybox.report.chart import chart_of
 from greybox.report.comparison import comparison_page
 from greybox.report.diagnosed_causes import cause_section
-from greybox.report.diagnosis import diagnosis_page, gain_section
+from greybox.report.diagnosis import diagnosis_page, gain_picture, gain_section
 from greybox.report.error_budget import noise_sentence
 from greybox.report.figures import to_svg
 from greybox.report.log import page_figures
@@ -45,8 +45,9 @@ def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
     diagnosis, model = demo.diagnosis, demo.estimate.model()
     found = cause_section(diagnosis)
     wrong = diagnosis_page(diagnosis, {}).sections[0]
+    extended = gain_section(diagnosis).pictures
     gain, *after = [
-        *gain_section(diagnosis).pictures,
+        *([gain_picture(demo.gain, " on the other log")] if extended else []),
         *_runs(demo.after, model, diagnosis.model),
     ]
     shown: list[tuple[Sequence[Picture], Sequence[Table], Sequence[Marked], Sequence[str]]] = [

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from experiment_design.output.result import Design
-from greybox.diagnosis.result import Diagnosis
+from greybox.diagnosis.result import Diagnosis, Gain
 from greybox.estimation.result import Estimate
 from greybox.files import sha256
 from greybox.study.blind_causes import Effect
@@ -75,6 +76,8 @@ class Demo:
     estimate : Estimate
     before, after : Comparison
         Free runs on the other log: of the estimate, and beside it of the extended model.
+    gain : mapping of str to Gain
+        By which the extended model's run on the other log is better, by channel.
     diagnosis : Diagnosis
     """
 
@@ -89,4 +92,5 @@ class Demo:
     estimate: Estimate
     before: Comparison
     after: Comparison
+    gain: Mapping[str, Gain]
     diagnosis: Diagnosis

@@ -287,16 +287,21 @@ def gain_section(diagnosis: Diagnosis) -> Section:
         heads = ("with these terms", "after")
         caption = "Fit against the terms that the data chose, which belong to no cause [%]"
         tables.append(_gain_table(caption, diagnosis.gain_over_chosen, heads))
-    caption = "Fit of the free run before and after, with the 95 % interval of the gain."
-    if any(min(g.before, g.after) < LOWEST_FIT for g in diagnosis.gain.values()):
-        caption += f" Below {LOWEST_FIT:.0f} % it is drawn at the edge."
-    told = "; ".join(f"{r[0]} {r[1]} to {r[2]}" for r in tables[0].rows)
     on = diagnosis.validated_on
-    picture = narrow(gain_figure(diagnosis.gain), "gain", caption, f"{caption} {told}.")
     return Section(
         "4. The gain", [capital(on).rstrip(".") + "."] if on else [],
-        [picture] if _changed(diagnosis) else [], tables,
+        [gain_picture(diagnosis.gain)] if _changed(diagnosis) else [], tables,
     )  # fmt: skip
+
+
+def gain_picture(gain: Mapping[str, Gain], where: str = "") -> Picture:
+    """Return fits before and after, with the intervals of their gains."""
+    caption = f"Fit of the free run before and after{where}, with the 95 % interval of the gain."
+    if any(min(g.before, g.after) < LOWEST_FIT for g in gain.values()):
+        caption += f" Below {LOWEST_FIT:.0f} % it is drawn at the edge."
+    rows = _gain_table("", gain, ("before", "after")).rows
+    told = "; ".join(f"{r[0]} {r[1]} to {r[2]}" for r in rows)
+    return narrow(gain_figure(gain), "gain", caption, f"{caption} {told}.")
 
 
 def _gain_table(caption: str, gain: Mapping[str, Gain], heads: tuple[str, str]) -> Table:

@@ -18,6 +18,7 @@ from virtual import PARAMETERS, virtual_log
 from experiment_design.demo.page import demo_page
 from experiment_design.demo.steps import Demo, Files, Step
 from experiment_design.output.report import design_page
+from greybox.diagnosis.result import Gain
 from greybox.model.catalogue import get_structure
 from greybox.prediction.predict import predict_manoeuvre
 from greybox.report.checks import check_page
@@ -60,6 +61,9 @@ def plan(model):
     return random_plan(model, load_vessel("thesis"), duration=120.0)
 
 
+GAIN = {s: Gain(71.0, 83.0, (9.0, 15.0)) for s in ("u", "v", "r")}
+
+
 @pytest.fixture(scope="module")
 def story(plan, logs, estimate, tmp_path_factory):
     """The page of the demo."""
@@ -75,7 +79,7 @@ def demo_of(folder, plan, log, estimate):
         files=Files(folder), steps=tuple(Step(f"Step {k}", "", ("Told.",)) for k in range(8)),
         design=plan, next_design=plan, trial=log, other=log,
         hidden=(Effect("thruster_lag", {"lag": 8.0}),), check=row_case("gap"), estimate=estimate,
-        before=before, after=after,
+        before=before, after=after, gain=GAIN,
         diagnosis=replace(diagnosis_of("named"), budget=BUDGET),
     )  # fmt: skip
 
@@ -142,4 +146,6 @@ def test_the_first_screen(written):
 
 def test_the_demo_tells_how_much_of_what_is_left_is_noise(story):
     assert "that is left: surge 33 %" in " ".join(story.sentences)
-    assert "Fit of the free run before and after" in story.lead.caption
+    assert "Fit of the free run before and after on the other log" in story.lead.caption
+    # of the models that its steps compare, not of the one that its diagnosis began with
+    assert "surge 71.0 % to 83.0 %" in story.lead.alternative
