@@ -154,8 +154,8 @@ def after_check(
         also = " ".join(f"--fix-also {i}" for i in judged)
         steps.append(NextStep("Mend these too where their pictures convince you", f"{mend} {also}"))
     lacking = [
-        f"Name the column of '{r.name}' that holds {what}, with its unit, in the vessel file's "
-        f"[columns]: {why}"
+        f"Name the raw column of '{r.name}' that holds {what}, with its unit, in the vessel file's "
+        f"[columns], and import again: {why}"
         for r in reports
         for name, what, why in (
             ("psi", "the heading as psi", "models of sway and yaw need it"),
@@ -164,8 +164,9 @@ def after_check(
         if r.recording is not None and name not in r.recording
     ]
     raw = any(r.recording is not None and not _is_log(r.recording) for r in reports)
-    if not steps and lacking:
-        steps.append(NextStep(lacking[0]))
+    if lacking:
+        # what is mended before lacks the column too
+        steps.insert(0, NextStep(lacking[0]))
     elif not steps and raw:
         target = "log.csv" if len(reports) == 1 else "imported"
         steps.append(

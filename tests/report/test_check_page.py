@@ -366,6 +366,12 @@ def test_what_comes_next_is_a_model_only_of_logs_that_have_a_heading():
     (step,) = after_check([whole, blind], SHIP, {})
     assert step.command == ""
     assert "'virtual' that holds the heading as psi" in step.purpose
+    # what is mended before lacks the heading too
+    degrees = replace(row_case("gap").findings[0], safe=True)
+    first, second = after_check([replace(blind, findings=(degrees,))], SHIP, {})
+    assert first.purpose == step.purpose
+    assert "import again" in first.purpose
+    assert second.command.endswith("--fix")
 
 
 def test_what_comes_next_is_a_model_only_of_logs_that_have_the_commands():
