@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -90,7 +91,12 @@ def _headline(diagnosis: Diagnosis) -> str:
     """Return the verdict, causes by their titles alone where all of it would fill the screen."""
     if len(diagnosis.causes) < 2 or len(diagnosis.headline) <= _LONGEST:
         return diagnosis.headline
-    titles = "; ".join(c.title for c in diagnosis.causes)
+    count = Counter(c.title for c in diagnosis.causes)
+    titles = "; ".join(
+        # causes of one title are told apart by what they estimate
+        f"{c.title} ({', '.join(c.parameters)})" if count[c.title] > 1 else c.title
+        for c in diagnosis.causes
+    )
     rest = " They do not explain all of it." if diagnosis.verdict == "partly" else ""
     return f"{len(diagnosis.causes)} causes stand: {titles}.{rest}"
 

@@ -556,8 +556,11 @@ def test_in_a_browser(tmp_path, pages, verdict):
 @pytest.mark.usefixtures("undrawn")
 def test_many_causes_stand_by_their_titles_on_the_first_screen():
     one = diagnosis_of("named").causes[0]
-    many = replace(diagnosis_of("partly"), causes=(one,) * 4)
+    other = replace(one, title="another cause")
+    many = replace(diagnosis_of("partly"), causes=(one, other, one, one))
     headline = diagnosis_page(many, RECORD).headline
-    assert headline.startswith(f"4 causes stand: {one.title}; ")
+    # causes of one title are told apart by what they estimate
+    told = f"{one.title} ({', '.join(one.parameters)})"
+    assert headline.startswith(f"4 causes stand: {told}; another cause; {told}; ")
     assert headline.endswith("They do not explain all of it.")
     assert one.evidence not in headline
