@@ -69,15 +69,16 @@ def headline(made: ManoeuvrePrediction) -> str:
     judged = [
         c for m in made.manoeuvres for c in m.criteria if c.verdict is not Compliance.NOT_APPLICABLE
     ]
-    count = {v: sum(c.verdict is v for c in judged) for v in Compliance}
+    of = {v: [c.name for c in judged if c.verdict is v] for v in Compliance}
     parts = [
-        f"{count[v]} of {len(judged)} {word}"
+        f"{len(of[v])} of {len(judged)} {word}"
+        + (f" ({', '.join(dict.fromkeys(of[v]))})" if v is not Compliance.PASS else "")
         for v, word in (
             (Compliance.PASS, "met"),
             (Compliance.FAIL, "failed"),
             (Compliance.OPEN, "cannot be told"),
         )
-        if count[v]
+        if of[v]
     ]
     told = (
         f"Limits of IMO MSC.137(76): {', '.join(parts)}."

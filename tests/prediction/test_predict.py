@@ -21,7 +21,7 @@ from greybox.prediction.predict import predict_manoeuvre
 from greybox.report.next_steps import after_prediction
 from greybox.report.prediction import headline
 from greybox.trial.log import make_log
-from greybox.trial.manoeuvres import Compliance, find_manoeuvres
+from greybox.trial.manoeuvres import Compliance, Criterion, find_manoeuvres
 from greybox.validation.fit import run_model
 from greybox.vessel.conditions import Conditions
 
@@ -276,6 +276,22 @@ def test_the_verdict_of_an_older_model_file_is_known(said, level, tmp_path):
     told = f"the estimate's own verdict on its coefficients is '{said}'."
     assert (told in made.notes) == (level is not TrustLevel.TRUST)
     assert ("not to be trusted" in headline(made)) == (level is TrustLevel.DO_NOT_TRUST)
+
+
+def test_the_headline_names_the_limits_that_are_not_met():
+    made = predict_manoeuvre(linear_ship(), "stopping", until=0.3, **FEW)
+    limits = [
+        Criterion(name, None, 4.5, verdict)
+        for name, verdict in (
+            ("tactical diameter", Compliance.PASS),
+            *[("advance", Compliance.FAIL)] * 2,
+            ("first overshoot", Compliance.OPEN),
+        )
+    ]
+    judged = replace(made.manoeuvres[0], criteria=tuple(limits))
+    said = headline(replace(made, manoeuvres=(judged,)))
+    told = "1 of 4 met, 2 of 4 failed (advance), 1 of 4 cannot be told (first overshoot)."
+    assert said.startswith(f"Limits of IMO MSC.137(76): {told}")
 
 
 @pytest.mark.parametrize(
