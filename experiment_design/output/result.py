@@ -18,6 +18,7 @@ from experiment_design.optimise.classical import Alternative
 from experiment_design.optimise.search import REFERENCE
 from experiment_design.request.regimes import spell_regime
 from experiment_design.request.request import PreparedRequest, build_problem
+from greybox.channels import CHANNELS
 from greybox.files import replacing
 from greybox.notebook import DisplayMixin, interval, items, number, sparkline, table, text
 from greybox.numerics.linalg import scaled_logdet
@@ -324,9 +325,12 @@ class Design(DisplayMixin):
         else:
             lines.append("no random two-level sequence keeps the limits, so there is none to beat")
         lines.append(self.certificate.sentence())
-        margins = ", ".join(f"{k} {v:.3g}" for k, v in self.margins.items())
+        margins = ", ".join(
+            f"{k} {v:.3g} {CHANNELS[k].unit if k in CHANNELS else ''}".rstrip()
+            for k, v in self.margins.items()
+        )
         if margins:
-            lines.append(f"least distance from zero: {margins} (m/s, rad/s)")
+            lines.append(f"least distance from zero: {margins}")
         lines += self.missed()
         if self.keeping is not None:
             lines.append(self.keeping.sentence())

@@ -110,7 +110,8 @@ def parse_regime(text: str, states: tuple[str, ...]) -> Signs:
             )
         if rest[0] not in states:
             raise UsageError(
-                f"the regime '{text}' names '{rest[0]}', this model has {', '.join(states)}."
+                f"the regime '{text}' names '{rest[0]}', and this model has {', '.join(states)}: "
+                f"write their signs, such as u+v+, or auto."
             )
         if rest[0] in dict(signs):
             raise UsageError(f"the regime '{text}' names '{rest[0]}' twice: name it once.")

@@ -89,6 +89,7 @@ def test_the_plan_keeps_its_limits_in_another_integrator(basic):
 
 def test_a_design_shows_itself(basic):
     text = basic.summary()
+    assert f"least distance from zero: u {basic.margins['u']:.3g} m/s, v " in text
     assert "times the information of the best of 200 random two-level sequences" in text
     assert "zig-zag" in text
     assert "<pre>Plan for Thesis ship" in basic._repr_html_()
@@ -557,7 +558,7 @@ def test_regimes_as_text():
     assert spell_regime(parse_regime("v-", ("u", "v"))) == "v-"
     with pytest.raises(UsageError, match="cannot be read at 'v'"):
         parse_regime("u+v", ("u", "v"))
-    with pytest.raises(UsageError, match="names 'w'"):
+    with pytest.raises(UsageError, match=r"names 'w', and .* has u, v: write their signs"):
         parse_regime("w+", ("u", "v"))
     with pytest.raises(UsageError, match="names 'u' twice"):
         parse_regime("u+u-", ("u", "v"))
