@@ -668,8 +668,8 @@ def _excitation_tests(
             ratio,
             None,
             f"smallest relative singular value {ratio:.1e} ({_WEAK:.0e} is needed): {found}. "
-            f"Of the sensitivity to {model.parameters[free[least]]} the least, "
-            f"{float(share[least]):.1e}, cannot be explained by those to the others.",
+            f"The sensitivity to {model.parameters[free[least]]} is imitated best by those to the "
+            f"others, all of it but {float(share[least]):.1e}.",
             _WEAK,
             passed,
             tuple(names),
