@@ -148,14 +148,14 @@ class PredictionDesign:
             shares = ", ".join(f"{n} {100 * share:.0f} %" for n, share in self.missed.items())
             said += (
                 f". These errors hold for a ship that the prior's structure fits. The prior has "
-                f"no verdict on its predictions: what its free runs missed of logs that its diagnosis held "
-                f"out ({shares} of the spread) is taken to stay after the trial"
+                f"no verdict on its predictions: what its free runs missed of logs that its "
+                f"diagnosis held out ({shares} of the spread) is taken to stay after the trial"
             )
         elif not self.level:
             said += (
                 f". These errors hold for a ship that the prior's structure fits. The prior has "
-                f"no verdict on its predictions: it is assumed to miss {100 * _UNKNOWN_MISFIT:.0f} % of each "
-                f"spread, most of which the trial tells, so take these numbers as a guess"
+                f"no verdict on its predictions: it is assumed to miss "
+                f"{100 * _UNKNOWN_MISFIT:.0f} % of each spread, most of which the trial tells, so take these numbers as a guess"
             )
         return f"{said}."
 
