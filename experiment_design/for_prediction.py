@@ -155,7 +155,8 @@ class PredictionDesign:
             said += (
                 f". These errors hold for a ship that the prior's structure fits. The prior has "
                 f"no verdict on its predictions: it is assumed to miss "
-                f"{100 * _UNKNOWN_MISFIT:.0f} % of each spread, most of which the trial tells, so take these numbers as a guess"
+                f"{100 * _UNKNOWN_MISFIT:.0f} % of each spread, most of which the trial tells, so "
+                f"take these numbers as a guess"
             )
         return f"{said}."
 
