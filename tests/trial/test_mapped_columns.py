@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from greybox.errors import LogError
+from greybox.trial.convert import two_pass_import
 from greybox.trial.convert.channel_mapping import read_recording
 from greybox.trial.convert.read import read_log
 from greybox.trial.import_files import import_files
@@ -66,6 +67,19 @@ def test_a_thruster_column_with_a_unit_in_brackets_is_found(tmp_path):
     # of two units neither is the right one
     frame.assign(**{"n_prop [rpm]": 60.0}).to_csv(tmp_path / "two.csv", index=False)
     assert "n_prop" not in read_recording(tmp_path / "two.csv", ship)
+
+
+@pytest.mark.parametrize("cells", [20_000_000, 0])
+def test_a_thruster_column_that_the_vessel_file_misspells_is_told(tmp_path, monkeypatch, cells):
+    monkeypatch.setattr(two_pass_import, "_LARGE_CELLS", cells)
+    frame = table(yaw=0.0).rename(columns={"n": "RPM_PORT"})
+    frame.to_csv(tmp_path / "raw.csv", index=False)
+    thruster = {"type": "fixed", "speed": "RPM_PROT"}
+    columns = {"tvec": "t", "yaw": "psi"}
+    ship = vessel_from_dict({"name": "V", "length": 10, "thruster": [thruster], "columns": columns})
+    said = import_files([tmp_path / "raw.csv"], ship, tmp_path / "log.csv")
+    told = "no column 'RPM_PROT', which the vessel file names. Did you mean 'RPM_PORT'?"
+    assert f"note: {told}\n" in said
 
 
 def test_unix_nanoseconds_are_no_seconds(tmp_path):

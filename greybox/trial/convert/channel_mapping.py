@@ -328,6 +328,12 @@ def batch_recording(
             f"columns not used: {shortened(ignored, 12)} (map those that belong to the log in the "
             f"vessel file's [columns])"
         )
+    if alone:
+        notes += [
+            f"no column '{c}', which the vessel file names.{near}"
+            for c in vessel.commands
+            if c not in assigned and (near := suggestion(c, ignored))
+        ]
     if alone and not set(assigned) & MOTION:
         notes.append(_NO_MOTION)
     return Recording(
