@@ -578,6 +578,21 @@ def test_north_and_east_may_be_called_n_and_e(tmp_path):
     assert "n taken for x_n in m, no unit being stated" in recording.notes
 
 
+def test_positions_may_be_called_by_names_with_umlauts(tmp_path):
+    table = track().rename(columns={"n": "Breite", "e": "Länge"})
+    table.assign(Breite=54.0).to_csv(tmp_path / "x.csv", index=False)
+    recording = read_recording(tmp_path / "x.csv", UNCLAIMED)
+    np.testing.assert_array_equal(recording["lon"].value, track()["e"])
+
+
+def test_a_speed_that_states_no_unit_says_what_to_do_about_knots(tmp_path):
+    track().assign(AWS=5.0, AWA=0.1).to_csv(tmp_path / "x.csv", index=False)
+    (said,) = (n for n in read_recording(tmp_path / "x.csv", UNCLAIMED).notes if "AWS" in n)
+    assert said == (
+        "AWS taken for V_q in m/s, no unit being stated (if it is in knots, say so in [columns])"
+    )
+
+
 @pytest.mark.parametrize("left_out", ["e", "n"])
 def test_n_or_e_alone_is_no_position(tmp_path, left_out):
     track().drop(columns=left_out).to_csv(tmp_path / "x.csv", index=False)

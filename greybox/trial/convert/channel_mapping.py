@@ -400,7 +400,8 @@ def _factor(
         if angle_unit(reach) == "deg":
             return "deg", np.pi / 180, f", since it reaches {reach[0]:.0f}"
         return "rad", 1.0, f", since it stays below {reach[0]:.2f}"
-    return target, 1.0, ", no unit being stated"
+    knots = " (if it is in knots, say so in [columns])" if target == "m/s" else ""
+    return target, 1.0, f", no unit being stated{knots}"
 
 
 def speed_unit(raw: Recording, assigned: Mapping[str, Assigned], vessel: Vessel) -> str | None:

@@ -56,6 +56,7 @@ _GUESSES: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 # north and east where both stand together; alone, n is a shaft speed
 _SHORT = {"x_n": "n", "y_n": "e"}
+_UMLAUTS = {"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"}
 # the field of messages that hold one value
 _ALONE = "data"
 
@@ -87,6 +88,8 @@ class Assigned:
 def split_unit(raw: str) -> tuple[str, str | None]:
     """Part a column name into its stem, lower case, and the unit that it carries."""
     stem, unit = _without_brackets(raw)
+    for umlaut, spelled in _UMLAUTS.items():
+        stem = stem.replace(umlaut, spelled)
     stem = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", stem)
     stem = re.sub(r"[^0-9a-zA-Z]+", "_", stem).strip("_").lower()
     return suffix_unit(stem) if unit is None else (stem, unit)
