@@ -152,7 +152,8 @@ def after_check(
     judged = dict.fromkeys(f.id for f in found if f.repair and not f.safe)
     if judged:
         also = " ".join(f"--fix-also {i}" for i in judged)
-        steps.append(NextStep("Mend these too where their pictures convince you", f"{mend} {also}"))
+        what = "these too where their pictures" if steps else "what needs judgement where pictures"
+        steps.append(NextStep(f"Mend {what} convince you", f"{mend} {also}"))
     lacking = [
         f"Name the raw column of '{r.name}' that holds {what}, with its unit, in the vessel file's "
         f"[columns], and import again: {why}"
