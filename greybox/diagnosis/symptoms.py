@@ -140,4 +140,4 @@ def coloured(fit: Fit, outputs: Sequence[str]) -> str | None:
             found.append(f"{word(outputs[group.outputs[0]])}{tail}")
     if not found:
         return None
-    return f"something that the model lacks moves {', '.join(found)}"
+    return f"something that the model lacks moves {' and '.join(found)}"
