@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from greybox.vessel.schema import AnyThruster, ColumnTable, ConditionsTable, SensorsTable
 
 _MOVED = ("angle", "rudder", "speed")
+# no rudder passes a right angle; an azimuth whose angle is not wrapped may make two turns [rad]
+_FARTHEST = {"rudder": math.pi / 2, "angle": 4 * math.pi}
 _CORRECTED = ("x_n", "y_n", "psi", "u", "v", "r", "u_q", "v_q")
 _log = logging.getLogger(__name__)
 EXAMPLES = ("thesis", "ferry")
@@ -216,6 +218,12 @@ def _limits(row: Mapping[str, Any], key: str, where: str) -> Limits:
         raise VesselError(
             f"{key}_limits of {where} run from {lower:g} to {upper:g}: "
             f"the first must be the smaller."
+        )
+    farthest = max(abs(lower or 0.0), abs(upper or 0.0))
+    if farthest > _FARTHEST.get(key, math.inf):
+        raise VesselError(
+            f"{key}_limits of {where} reach {farthest:g} rad, and {_FARTHEST[key]:.3g} rad at most "
+            f"are possible: write radians, {math.radians(farthest):.4g} for {farthest:g} deg."
         )
     return Limits(lower, upper, row.get(f"{key}_rate"))
 

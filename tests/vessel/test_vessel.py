@@ -264,6 +264,7 @@ def test_all_that_a_diagnosis_adds_survives_a_round_trip():
         ({"thrust": [[1, 2]]}, "has 1 point"),
         ({"thrust": [[1, 2], [0, 1]]}, "goes from 1 to 0"),
         ({"speed_limits": [5, 1]}, "run from 5 to 1"),
+        ({"angle_limits": [-180, 180]}, "reach 180 rad, and 12.6 .* radians, 3.142 for 180 deg"),
         ({"speed_rate": -1}, "must be positive"),
         ({"x": "two"}, "a finite number is needed"),
         ({"drive": "comand"}, "Did you mean 'command'"),
@@ -285,6 +286,12 @@ def test_all_that_a_diagnosis_adds_survives_a_round_trip():
 def test_bad_thrusters(change, message):
     with pytest.raises(VesselError, match=message.replace("[", r"\[")):
         vessel({**AZIMUTH, **change})
+
+
+def test_limits_of_a_rudder_are_not_degrees():
+    rudder = {"type": "propeller_rudder", "speed": "n", "rudder": "d", "rudder_limits": [-35, 35]}
+    with pytest.raises(VesselError, match=r"reach 35 rad, and 1\.57 .* 0\.6109 for 35 deg"):
+        vessel(rudder)
 
 
 @pytest.mark.parametrize(
