@@ -43,6 +43,8 @@ _FROUDE_MOST = 0.4
 _BLOCK_LEAST = 0.35
 # beam over draught where nothing tells the draught (Watson and Gilfillan, 1977: 2.25 to 3.75)
 _BEAM_DRAUGHT = 2.8
+# displaced volume over length cubed, below which a mass is one in tonnes; rowing shells have 2e-4
+_VOLUME_LENGTH_LEAST = 5e-5
 # the formulas of Clarke and others hold for displacement ships; beyond these ratios they are taken
 # at the nearest end, where they would turn the sign of damping and added mass
 _BEAM_LENGTH_RANGE, _BEAM_DRAUGHT_RANGE = (0.1, 0.2), (2.0, 4.5)
@@ -255,6 +257,11 @@ def main_dimensions(vessel: Vessel) -> MainDimensions:
     """
     length, beam, mass = vessel.length, vessel.beam, vessel.mass
     draught = vessel.conditions.draught
+    if mass is not None and mass < (least := _VOLUME_LENGTH_LEAST * _WATER * length**3):
+        raise VesselError(
+            f"the vessel file has the mass {mass:g} kg, and a vessel of length {length:g} m has "
+            f"more than {least:.2g} kg: write the mass in kg, or correct the length."
+        )
     notes: list[str] = []
     speed = vessel.service_speed
     rudder = any(t.rudder is not None for t in vessel.thrusters)

@@ -210,6 +210,11 @@ def test_speed_comes_from_thrust_in_newtons():
 def test_impossible_vessels_are_refused_in_a_sentence():
     with pytest.raises(VesselError, match=r"mass 1e\+09 kg, .* correct mass, beam or draught"):
         main_dimensions(known_vessel("kvlcc2-320m", mass=1e9))
+    tonnes = known_vessel("training-ship-105m").mass / 1000
+    with pytest.raises(
+        VesselError, match=r"of length 105 m has more than .*: write the mass in kg"
+    ):
+        main_dimensions(known_vessel("training-ship-105m", mass=tonnes))
     with pytest.raises(VesselError, match="driven by 'n1' has no speed_limits"):
         semi_empirical_model(load_vessel("ferry"))
 
