@@ -425,15 +425,37 @@ def test_a_speed_over_ground_without_a_unit_goes_as_far_as_the_positions(
     limited(block_bytes=1 << 13, block_rows=100)
     text = import_files([tmp_path / "raw.csv"], vessel, tmp_path / "log.csv")
     told = "m/s" if place == "none" else unit
-    why = (
-        ", no unit being stated"
-        if told == "m/s"
-        else ", since so it goes as far as the positions do"
-    )
+    fits = ", since so it goes as far as the positions do"
+    why = ", no unit being stated" if place == "none" else fits
     assert f"note: SOG taken for sog in {told}{why}" in text
     log = pd.read_csv(tmp_path / "log.csv")
     factor = 1.0 if told == unit else 1 / UNITS[unit].factor
     np.testing.assert_allclose(log["u"].max(), 4.0 * factor, rtol=1e-3)
+
+
+@pytest.mark.parametrize("cells", [20_000_000, 0])
+@pytest.mark.parametrize(
+    ("mapping", "read"),
+    [({"name": "sog"}, "m/s"), ({"name": "sog", "unit": "km/h"}, "km/h"), (None, "")],
+)
+def test_a_speed_over_ground_in_another_unit_than_stated_is_told(
+    tmp_path, monkeypatch, mapping, read, cells
+):
+    t = np.arange(200.0)
+    named = "SOG" if mapping else "SOG (kts)"
+    speed = 4 / UNITS["kn"].factor + 0 * t
+    table = {"t": t, "north": 4 * t, "east": 0 * t, "psi": 0 * t, named: speed, "cog": 0 * t}
+    pd.DataFrame(table | {"rpm": 100 + 0 * t}).to_csv(tmp_path / "raw.csv", index=False)
+    vessel = vessel_from_dict(
+        {"name": "S", "length": 30, "thruster": [{"type": "fixed", "speed": "rpm"}]}
+        | {"columns": {"SOG": mapping} if mapping else {}}
+    )
+    monkeypatch.setattr(stream, "_LARGE_CELLS", cells)
+    text = import_files([tmp_path / "raw.csv"], vessel, tmp_path / "log.csv")
+    told = f"SOG is read in {read}, and goes as far as the positions do in kn: correct its unit"
+    assert (told in text) == (mapping is not None)
+    factor = UNITS[read or "kn"].factor / UNITS["kn"].factor
+    np.testing.assert_allclose(pd.read_csv(tmp_path / "log.csv")["u"], 4 * factor)
 
 
 @pytest.mark.parametrize("cells", [20_000_000, 0])

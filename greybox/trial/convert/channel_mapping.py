@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -355,11 +356,12 @@ def canonical(
 ) -> Recording:
     """Rename and convert the signals of a recording; state every guess.
 
-    `reach` gives largest value and step of angles, and `speed` the unit of the speed over
-    ground, whose unit is to be guessed, where the recording is only a part of what there is.
+    Where the recording is only a part of what there is, `reach` gives largest value and step
+    of angles whose unit is to be guessed, and `speed` what `speed_unit` found, empty for nothing.
     """
     by_name = {s.name: s for s in raw.signals}
-    speed = speed or speed_unit(raw, assigned, vessel)
+    if speed is None:
+        speed = speed_unit(raw, assigned, vessel)
     signals, notes = [], []
     for name, a in assigned.items():
         signal = by_name.get(a.raw)
@@ -368,9 +370,15 @@ def canonical(
         if a.how != "guessed" and signal.unit is not None and a.how != "mapped":
             a = replace(a, unit=signal.unit)
         unit, factor, why = _factor(a, signal, vessel, (reach or {}).get(name))
-        if name == "sog" and speed and speed != unit and _unstated(a, signal):
-            unit, factor = speed, unit_factor(speed, "m/s", a.raw)
-            why = ", since so it goes as far as the positions do"
+        if name == "sog" and speed:
+            fitting = unit_factor(speed, "m/s", a.raw)
+            if a.unit is None and a.how != "exact":
+                unit, factor, why = speed, fitting, ", since so it goes as far as the positions do"
+            elif not math.isclose(fitting, factor, rel_tol=0.3):
+                notes.append(
+                    f"{a.raw} is read in {unit}, and goes as far as the positions do in {speed}: "
+                    f"correct its unit in [columns]"
+                )
         if a.how == "guessed":
             size = f" in {unit}" if unit else ""
             notes.append(f"{a.raw} taken for {name}{size}{why}")
@@ -404,29 +412,24 @@ def _factor(
     return target, 1.0, f", no unit being stated{knots}"
 
 
-def speed_unit(raw: Recording, assigned: Mapping[str, Assigned], vessel: Vessel) -> str | None:
-    """Return the unit of a speed over ground that states none, where the positions tell it."""
+def speed_unit(raw: Recording, assigned: Mapping[str, Assigned], vessel: Vessel) -> str:
+    """Return the unit by which the speed over ground goes as far as positions, or ``""``."""
     by_name = {s.name: s for s in raw.signals}
     a = assigned.get("sog")
-    if a is None or not _unstated(a, by_name.get(a.raw)):
-        return None
+    if a is None or a.raw not in by_name:
+        return ""
     pair = next((p for p in (PLACE, ("lat", "lon")) if assigned.keys() >= set(p)), None)
     if pair is None or any(assigned[n].raw not in by_name for n in pair):
-        return None
+        return ""
     place = [(assigned[n], by_name[assigned[n].raw]) for n in pair]
     north, east = (replace(s, value=s.value * _factor(a, s, vessel)[1]) for a, s in place)
     if len(north) != len(east):
-        return None
+        return ""
     if pair != PLACE:
         if not np.isfinite(places(north, east)[1]).any():
-            return None
+            return ""
         north, east, _ = local_positions(north, east)
-    return unit_of_speed(by_name[a.raw], north, east)
-
-
-def _unstated(a: Assigned, signal: Signal | None) -> bool:
-    """Whether nothing states the unit of a signal, not even a canonical name."""
-    return signal is not None and signal.unit is None and a.unit is None and a.how != "exact"
+    return unit_of_speed(by_name[a.raw], north, east) or ""
 
 
 def angle_reach(value: Array) -> tuple[float, float]:

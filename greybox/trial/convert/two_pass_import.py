@@ -126,10 +126,9 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
             f"sort it, or cut it where time goes back."
         )
     units = {n: angle_unit(reach) for n, reach in found.reach.items()}
-    speed = found.speed or "m/s"
     if "sog" in assigned and assigned["sog"].unit is None:
-        units["sog"] = speed
-    whole = canonical(found.sample, assigned, vessel, found.reach, speed)
+        units["sog"] = found.speed or "m/s"
+    whole = canonical(found.sample, assigned, vessel, found.reach, found.speed)
     derived = derive_signals(whole, found.origin)
     steps = (*before.steps, *reading_steps(table, found.scale))
     decided = {n: replace(a, unit=units[n]) if n in units else a for n, a in assigned.items()}
@@ -214,7 +213,7 @@ class _Found:
         self.newest = -np.inf
         self.parts: dict[str, _Parts] = {}
         self.reach: dict[str, tuple[float, float]] = {}
-        self.speed: str | None = None
+        self.speed = ""
         self.raw = self.sample = Recording("", ())
 
     def add(self, batch: Batch) -> None:
@@ -231,7 +230,7 @@ class _Found:
         self._order(t[good])
         self._reach(raw)
         self.speed = self.speed or speed_unit(raw, self.assigned, self.vessel)
-        recording = canonical(raw, self.assigned, self.vessel, speed=self.speed or "m/s")
+        recording = canonical(raw, self.assigned, self.vessel, speed=self.speed)
         if not self.sample.signals:
             self.sample, self.raw = _head(raw, _SAMPLE_ROWS), recording
         if self.origin is None:
@@ -385,7 +384,7 @@ class Stream:
         """Return the first row that the next block needs, and the pieces of this one."""
         scan, plan = self.scan, self.scan.plan
         raw = batch_recording(self.table, block, scan.assigned, scan.scale, self.vessel)
-        recording = canonical(raw, scan.assigned, self.vessel)
+        recording = canonical(raw, scan.assigned, self.vessel, speed="")
         t = scan.scale.seconds(block[scan.assigned["t"].raw])
         finite = t[np.isfinite(t)]
         if not len(finite):
