@@ -74,10 +74,13 @@ def draw_plan_track(axes: Any, design: Design, band: MotionBand, size: float = 7
     axes.plot(east, north, color=BLUE, linewidth=1.2, zorder=3, label="track")
     marks = np.arange(0, len(north), max(1, round(step / r.sample_time)))
     if not band.certain and len(marks) > 1:
+        # what the map cuts would be lines that lead nowhere
+        whole = [
+            h for h in band.hulls(marks[1:]) if (h > low[::-1]).all() and (h < high[::-1]).all()
+        ]
         axes.add_collection(
             PolyCollection(
-                band.hulls(marks[1:]), facecolor="none", edgecolor="#6ba3cc",
-                linewidth=0.5, zorder=2,
+                whole, facecolor="none", edgecolor="#6ba3cc", linewidth=0.5, zorder=2,
             )
         )  # fmt: skip
     unit = "min" if step >= 60 else "s"
