@@ -37,6 +37,7 @@ from experiment_design.prepare import require_own_commands
 from experiment_design.request.exclusions import require_compatible
 from experiment_design.request.regimes import STEADY_SECONDS, start_words
 from experiment_design.request.request import PreparedRequest, build_problem
+from greybox.channels import CHANNELS
 from greybox.diagnosis.result import finite
 from greybox.errors import InfeasibleError
 from greybox.model.model import ManoeuvringModel
@@ -121,10 +122,13 @@ class PredictionDesign:
 
     def headline(self) -> str:
         """Return in one sentence what the plan is for and what is expected of it."""
-        error = ", ".join(f"{n} {np.hypot(self.noise[n], self.misfit[n]):.2g}" for n in self.noise)
+        error = ", ".join(
+            f"{n} {np.hypot(self.noise[n], self.misfit[n]):.2g} {CHANNELS[n].unit}"
+            for n in self.noise
+        )
         said = (
             f"After this trial predictions over the operating envelope are expected to be off by "
-            f"{error} (rms, m/s and rad/s, where the estimate chooses its terms by this trial)"
+            f"{error} (rms, where the estimate chooses its terms by this trial)"
         )
         if np.isfinite(self.random):
             often = f"{self.random:.2f} times as much"
@@ -164,7 +168,8 @@ class PredictionDesign:
         """Return the plan as text."""
         r = self.design.request
         ranges = ", ".join(
-            f"{n} {low:.4g} to {high:.4g}" for n, (low, high) in self.commands.items()
+            f"{n} {low:.4g} to {high:.4g}{' rad' if n in r.vessel.angle_commands else ''}"
+            for n, (low, high) in self.commands.items()
         )
         lines = [
             f"Plan for {r.vessel.name}: {r.trials} trial{'s' if r.trials > 1 else ''} of "
@@ -177,7 +182,7 @@ class PredictionDesign:
         if self.crossings:
             part = sum(b - a for a, b in self.crossings) / r.duration
             lines.append(
-                f"sway comes within {_CLOSE:g} deviations of its sensor from zero "
+                f"sway comes within {_CLOSE:g} standard deviations of its noise from zero "
                 f"{len(self.crossings)} times, {100 * part:.0f} % of the trial: --margin-v of "
                 f"greybox estimate cuts these samples (Remark 4.2)"
             )

@@ -271,6 +271,8 @@ def test_a_plan_leaves_less_than_random_sequences(found) -> None:
     assert f"leaves {gain:.2f} times the mean squared error" in found.summary()
     assert "the mean would predict" not in found.summary()
     assert "poor" in found.headline()
+    error = np.hypot(found.noise["r"], found.misfit["r"])
+    assert f", r {error:.2g} rad/s (rms" in found.headline()
     # commands stay in the envelope, the motion keeps way on
     commands = found.design.commands[0]
     for i, (low, high) in enumerate(found.commands.values()):
