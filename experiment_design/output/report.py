@@ -140,9 +140,13 @@ def _trial(design: Design, band: MotionBand) -> Section:
         if band.certain
         else f"The band holds about 95 % of {band.draws - band.lost} motions, of models drawn from "
         f"the prior{' with process noise' if r.noise.process.any() else ''}"
-        + (f"; {band.lost} more ran away and are left out." if band.lost else ".")
+        + (f"; left out: {band.lost} more that ran away." if band.lost else ".")
     )
-    outlines = "" if band.certain else " The thin outlines are its parts at the numbered times."
+    outlines = (
+        ""
+        if band.certain
+        else " The thin outlines are its parts at the numbered times, where the map holds them."
+    )
     cells = ", ".join(
         f"{n} from {signed(band[n].nominal.min(), 2)} to {signed(band[n].nominal.max(), 2)}"
         for n in names
