@@ -38,6 +38,8 @@ Array = NDArray[np.float64]
 
 _DEGREES = 180 / math.pi
 
+# share of the draws whose tracks set the room of a picture to each side
+_DRAWN = 0.9
 _DOUBTS = {
     PredictionLevel.LIMITED: ("the model's free run was of limited use on held-out logs",),
     PredictionLevel.POOR: ("the model's free run was poor on held-out logs",),
@@ -181,6 +183,8 @@ def _pictures(made: PredictedManoeuvre, key: str) -> list[Picture]:
     if "steering" in made.bundle.nominal:
         panels.append(("steering", "steering [deg]", _DEGREES))
     drawn = "Tracks of the estimate's own run and of some draws."
+    if _view(made, 0)[2] or _view(made, 1)[2]:
+        drawn += " A few draws go on beyond the edge."
     if made.kind == "zigzag":
         drawn += " Its scales along and across differ."
     return [
@@ -223,10 +227,30 @@ def _history(axes: Any, made: PredictedManoeuvre, name: str, factor: float) -> N
         axes.set_ylim(min(view[0], measured.min()), max(view[1], measured.max()))
 
 
+def _view(made: PredictedManoeuvre, k: int) -> tuple[float, float, bool]:
+    """Return the range along (0) or across (1) that a picture holds [m], and whether it cuts.
+
+    A draw that leaves its circle would make the run too small to be read.
+    """
+    whole = [made.bundle.tracks[0][k], np.zeros(1)]
+    if made.agreement is not None:
+        whole.append(made.agreement.track[k])
+    low, high = min(float(np.min(w)) for w in whole), max(float(np.max(w)) for w in whole)
+    lows, highs = ([f(d[k]) for d in made.bundle.tracks] for f in (np.min, np.max))
+    low = min(low, float(np.quantile(lows, 1 - _DRAWN)))
+    high = max(high, float(np.quantile(highs, _DRAWN)))
+    margin, room = 0.05 * max(high - low, 1e-6), 0.5 * (high - low)
+    least, most = min(low, *map(float, lows)), max(high, *map(float, highs))
+    cut = least < low - room or most > high + room
+    return max(least, low - room) - margin, min(most, high + room) + margin, cut
+
+
 def _track(made: PredictedManoeuvre) -> Any:
     figure = new_figure(5.4, 5.6)
     axes = figure.add_subplot()
     tracks = made.bundle.tracks
+    axes.set_ylim(*_view(made, 0)[:2])
+    axes.set_xlim(*_view(made, 1)[:2])
     for north, east in tracks[:0:-1]:
         axes.plot(east, north, color=BLUE, alpha=0.15, linewidth=0.7)
     axes.plot([], [], color=BLUE, alpha=0.3, linewidth=0.7, label="draws")

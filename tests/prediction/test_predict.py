@@ -19,7 +19,7 @@ from greybox.model.noise import NoiseLevels
 from greybox.prediction.measuring import quantities
 from greybox.prediction.predict import predict_manoeuvre
 from greybox.report.next_steps import after_prediction
-from greybox.report.prediction import headline
+from greybox.report.prediction import headline, prediction_page
 from greybox.trial.log import make_log
 from greybox.trial.manoeuvres import Compliance, Criterion, find_manoeuvres
 from greybox.validation.fit import run_model
@@ -276,6 +276,17 @@ def test_the_verdict_of_an_older_model_file_is_known(said, level, tmp_path):
     told = f"the estimate's own verdict on its coefficients is '{said}'."
     assert (told in made.notes) == (level is not TrustLevel.TRUST)
     assert ("not to be trusted" in headline(made)) == (level is TrustLevel.DO_NOT_TRUST)
+
+
+@pytest.mark.parametrize(("far", "cut"), [(1.3, False), (20.0, True)])
+def test_a_draw_that_leaves_its_circle_does_not_make_the_picture_small(far, cut):
+    made = predict_manoeuvre(rudder_model(spread=0.03), "turning", side="port", **FEW)
+    turn = made.manoeuvres[0]
+    run = turn.bundle.tracks[0]
+    tracks = (*[run] * 20, (far * run[0], far * run[1]))
+    shown = replace(turn, bundle=replace(turn.bundle, tracks=tracks))
+    lead = prediction_page(replace(made, manoeuvres=(shown,)), {}).lead
+    assert ("A few draws go on beyond the edge." in lead.caption) == cut
 
 
 def test_the_headline_names_the_limits_that_are_not_met():
