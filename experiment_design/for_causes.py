@@ -209,7 +209,8 @@ def open_causes(
         except UsageError as error:
             if asked.named:
                 raise
-            notes.append(f"{name} is left out: {error}")
+            # a diagnosis named it: no list of other causes helps
+            notes.append(f"{name} is left out: {str(error).partition('. ')[0].rstrip('.')}.")
             continue
         found.append(_sized(hypothesis, estimate))
     if not found:

@@ -159,7 +159,8 @@ def _prepared(
     if asked.trials < 1:
         raise UsageError(f"--trials is {asked.trials}, it must be 1 or more.")
     noise = noise_levels(model, vessel, asked.process_noise)
-    notes.append(f"noise: {noise.source}")
+    prefix = "" if noise.source.startswith("noise") else "noise: "
+    notes.append(f"{prefix}{noise.source}")
     predictor = _predictor(model, structure, asked, notes)
     d, dt = expected_disturbances(model, asked), model.sample_time
     measuring = PREDICTORS[predictor].air_measured
