@@ -76,6 +76,8 @@ class Planted:
     cause: str
     also: tuple[str, ...] = ()
     numbers: tuple[tuple[str, float], ...] = ()
+    # whether all of these names may stand for parts of the effect at once
+    together: bool = False
 
 
 EFFECTS = (
@@ -111,7 +113,7 @@ def sail(
         planted = Planted("thruster_gain", ("asymmetry",))
         ship = ship if clean else replace(ship, **{weak: 0.75})
     elif effect == "lag":
-        planted = Planted("thruster_lag", ("rate_limit", "input_delay"))
+        planted = Planted("thruster_lag", ("rate_limit", "input_delay"), together=True)
     elif effect == "delay":
         planted = Planted("input_delay", (), (("delay", _delay(preset)),))
     elif effect == "angle_offset":
@@ -287,15 +289,23 @@ def _budget(
 ) -> list[tuple[float, float, float, float]]:
     """Return the share of the planted cause by state: measured, told, and its interval.
 
-    What else it may be called counts only where it does not stand by its own name.
+    What else it may be called counts only where it does not stand by its own name, or as one sum
+    with it where orders are late by a lag and by a limited rate at once.
     """
     ids = {part["part"].split(":")[0] for part in parts}
     names = {planted.cause} if planted.cause in ids else {*planted.also}
-    return [
-        (measured, part["share"][state], *part["ci"][state])
-        for part in parts if part["part"].split(":")[0] in names
-        for state, measured in zip(part["share"], map(float, shares), strict=True)
-    ]  # fmt: skip
+    if planted.together:
+        names |= {*planted.also}
+    mine = [part for part in parts if part["part"].split(":")[0] in names]
+    groups = [mine] if planted.together and mine else [[part] for part in mine]
+    out = []
+    for group in groups:
+        for state, measured in zip(group[0]["share"], map(float, shares), strict=True):
+            told = sum(part["share"][state] for part in group)
+            low, high = np.array([part["ci"][state] for part in group]).T
+            middle, half = (high + low) / 2, float(np.hypot.reduce((high - low) / 2))
+            out.append((measured, told, middle.sum() - half, middle.sum() + half))
+    return out
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

@@ -2,7 +2,10 @@
 
 A cause takes what switching it off at sea would: the extended model says what the logs would show
 without it, the model without causes is fitted to that anew, and its held-out error is compared with
-what it was, both times with the coefficients whose free runs follow the logs most nearly. What the
+what it was, both times with the coefficients whose free runs follow the logs most nearly. Of
+thrusters that act late the logs are as they were, and the commands act as the cause says; a lag and
+a limited rate do much of what each other does, so that what they take is averaged over their order
+(Shapley, 1953). What the
 extended model leaves is told apart into what a generic force of motion and commands predicts of it,
 and, of the rest, sensor noise, waves and a slow force by their spectra. Causes of which each
 lessens the error of the others take more together than there is, or less: the difference is not
@@ -13,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import factorial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,11 +55,14 @@ class SwitchedOff:
         where no run without the cause stays bounded.
     relative : float
         Standard error of the cause's size, as a share of the size.
+    taken : ndarray, optional
+        (N, nx) what the cause takes of the squared errors; by default all that they fall by.
     """
 
     id: str
     errors: Array
     relative: float
+    taken: Array | None = None
 
 
 def errors_before(
@@ -125,6 +132,67 @@ def errors_without(
             return np.zeros((0, len(pair.held.structure.states)))
         out.append(_states(found.held, found.held_fit))
     return np.concatenate(out)
+
+
+def errors_acting(
+    final: Sequence[Pair],
+    before: Fit,
+    acting: Callable[[Point, Ship], Ship],
+    first: Callable[[Sequence[TrialLog]], Mapping[str, float]],
+) -> Array:
+    """Return the held-out errors of the model without causes where its thrusters act as one says.
+
+    Parameters
+    ----------
+    final, before, first
+        As of `errors_without`.
+    acting : callable
+        Of a point of the extended model and a ship: the ship whose thrusters act as in that point.
+
+    Returns
+    -------
+    ndarray
+        (N, nx), of all that is held out; empty where a run leaves every bound.
+    """
+    out = []
+    for pair in final:
+        begun = _starts(pair.problem.runs, before, pair.fit, first)
+        late = [replace(p, base=acting(pair.fit.point, p.base)) for p in begun]
+        found = _nearest(pair.problem.runs, pair.held.runs, late)
+        if found is None:
+            return np.zeros((0, len(pair.held.structure.states)))
+        out.append(_states(found.held, found.held_fit))
+    return np.concatenate(out)
+
+
+def averaged(base: Array, errors: Mapping[frozenset[str], Array], name: str) -> Array | None:
+    """Return what one of several causes takes of squared errors, averaged over their order.
+
+    Parameters
+    ----------
+    base : ndarray
+        (N, nx) errors with all of them.
+    errors : mapping
+        Of every set of ids, (N, nx) errors where the causes of that set are mended.
+    name : str
+        The id.
+
+    Returns
+    -------
+    ndarray or None
+        (N, nx); None where the errors of some set are unknown.
+    """
+    known = {frozenset[str](): base, **errors}
+    if not all(len(e) for e in known.values()):
+        return None
+    every = max(known, key=len)
+    out = np.zeros_like(base)
+    for some in known:
+        if name not in some:
+            share = factorial(len(some)) * factorial(len(every) - len(some) - 1)
+            fell = known[some] ** 2 - known[some | {name}] ** 2
+            out += share / factorial(len(every)) * fell
+    return out
 
 
 def _runs_without(
@@ -256,6 +324,7 @@ def error_budget(
     left_over = {MOTION: e1**2 - rest**2}
     without = {c.id: c.errors for c in causes if len(c.errors)}
     before = {name: e0**2 - errors**2 for name, errors in without.items()} | left_over
+    before |= {c.id: c.taken for c in causes if c.taken is not None}
     if terms is not None and len(terms):
         # what terms do beside causes only is no share of theirs: it cannot be split
         alone = (terms**2).sum(axis=0) < (e0**2).sum(axis=0)

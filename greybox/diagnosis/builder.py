@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,9 @@ from numpy.typing import NDArray
 from greybox.diagnosis.budget import (
     Drop,
     SwitchedOff,
+    averaged,
     error_budget,
+    errors_acting,
     errors_before,
     errors_without,
     without_share,
@@ -45,9 +48,9 @@ from greybox.diagnosis.result import (
 )
 from greybox.diagnosis.ruling import rule
 from greybox.diagnosis.search import Candidate, Search, backwards, instead
-from greybox.diagnosis.ship import CURRENTS
+from greybox.diagnosis.ship import CURRENTS, Ship
 from greybox.diagnosis.symptoms import find_symptoms
-from greybox.diagnosis.thresholds import WORTH
+from greybox.diagnosis.thresholds import PROVEN, WORTH
 from greybox.diagnosis.waves import Waves
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
@@ -63,6 +66,8 @@ Array = NDArray[np.float64]
 
 # models drawn from the covariance of the extended one, to see whether they stay bounded
 _DRAWS = 64
+# the terms of the extended model that stand for no cause, as a set of ids
+_NAMELESS = frozenset({"terms without a name"})
 
 
 class DiagnosisBuilder:
@@ -137,6 +142,10 @@ class DiagnosisBuilder:
                 evidence += ", or in a steady wind that was not measured"
         elif self.case.metric == "free run" and not denied("lever_arm", self.agreeing):
             evidence += _or_alike(candidate.hypothesis)
+        weighed = candidate.standing
+        if weighed is not None and weighed.direction < PROVEN:
+            less = 100 * (1 - weighed.direction)
+            evidence += f", and {less:.1f} % of winds turned at random would explain less"
         return Found(
             candidate.hypothesis.id, candidate.hypothesis.key, cause.title, quantities,
             candidate.p_value, candidate.p_adjusted, evidence, cause.extension,
@@ -218,31 +227,36 @@ class DiagnosisBuilder:
             return ()
 
         alike = by_name(named)
-        drops: list[Drop] = [
-            partial(leave_out, [c.hypothesis for c in causes]) for causes in alike.values()
-        ]
+        late = [k for k, causes in alike.items() if all(c.hypothesis.past for c in causes)]
+        before, first = found.before, self.case.first
+        # those whose logs the extended model has to say, one by one, and those that act late
+        asked: dict[frozenset[str], Callable[[], Array]] = {
+            frozenset(): partial(errors_before, diagnosed, before, first)
+        }
+        for name in [k for k in alike if k not in late]:
+            drop: Drop = partial(leave_out, [c.hypothesis for c in alike[name]])
+            asked[frozenset({name})] = partial(errors_without, pairs, before, drop, first)
+        together = [frozenset(s) for n in range(len(late)) for s in combinations(late, n + 1)]
+        for some in together:
+            acting = partial(_acting, [c.hypothesis for name in some for c in alike[name]])
+            asked[some] = partial(errors_acting, pairs, before, acting, first)
         nameless = self._nameless(final)
         if nameless:
-            drops.append(partial(_at_zero, nameless))
-        before, first = found.before, self.case.first
-        base, *without = map_forked(
-            lambda errors: errors(),
-            [
-                partial(errors_before, diagnosed, before, first),
-                *(partial(errors_without, pairs, before, drop, first) for drop in drops),
-            ],
-        )
-        parts = map(
-            SwitchedOff,
-            alike,
-            without,
-            [
-                min(_relative(quantities_of(problem, c, final)) for c in causes)
-                for causes in alike.values()
-            ],
-        )
-        terms = without[-1] if nameless else None
-        return error_budget(base, pairs, list(parts), terms, waves, self.seed)
+            drop = partial(_at_zero, nameless)
+            asked[_NAMELESS] = partial(errors_without, pairs, before, drop, first)
+        made = map_forked(lambda work: work(), list(asked.values()))
+        errors = dict(zip(asked, made, strict=True))
+        base, acting_late = errors[frozenset()], {some: errors[some] for some in together}
+        parts = [
+            SwitchedOff(
+                name,
+                errors[frozenset({name})],
+                min(_relative(quantities_of(problem, c, final)) for c in causes),
+                averaged(base, acting_late, name) if name in late and len(base) else None,
+            )
+            for name, causes in alike.items()
+        ]
+        return error_budget(base, pairs, parts, errors.get(_NAMELESS), waves, self.seed)
 
     def _nameless(self, final: Fit) -> frozenset[int]:
         """Return the places of terms of the extended model that stand for no cause."""
@@ -309,10 +323,10 @@ class DiagnosisBuilder:
 
     def _stands(self, rival: Candidate, without: Fit) -> bool:
         """Whether a rival, too, does more than a generic force."""
-        with_it, less = (self.case.held_out(f.integrator).pairs(f) for f in (rival.fit, without))
-        problem = self.case.problem(rival.fit.integrator)
+        integrator = rival.fit.integrator
+        problem, held_out = self.case.problem(integrator), self.case.held_out(integrator)
         return standing(
-            problem, rival.hypothesis, rival.fit, with_it, less, self.found.tried
+            problem, rival.hypothesis, rival.fit, without, held_out, self.found.tried
         ).stands
 
     def gain(
@@ -494,6 +508,15 @@ def leave_out(hypotheses: Sequence[Hypothesis], problem: Problem, point: Point) 
     for hypothesis in hypotheses:
         point = problem.drop(point, hypothesis)
     return point
+
+
+def _acting(hypotheses: Sequence[Hypothesis], point: Point, ship: Ship) -> Ship:
+    """Return a ship with some hypotheses as they are in a point of the extended model."""
+    keys = {h.key for h in hypotheses}
+    for hypothesis, value in zip(point.hypotheses, point.values, strict=True):
+        if hypothesis.key in keys and hypothesis.apply is not None:
+            ship = hypothesis.apply(ship, value)
+    return ship
 
 
 def _at_zero(terms: frozenset[int], problem: Problem, point: Point) -> Point:

@@ -22,6 +22,7 @@ from greybox.diagnosis.causes.hull import is_coupling, term_parameters
 from greybox.diagnosis.causes.sensors import abeam
 from greybox.diagnosis.evidence.held_out import worse
 from greybox.diagnosis.evidence.kinematics import denied
+from greybox.diagnosis.evidence.wind_direction import wind_direction
 from greybox.diagnosis.fitting import Problem, stacked
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.noise import Noise
@@ -32,6 +33,7 @@ from greybox.diagnosis.quantities import quantities_of
 from greybox.diagnosis.refitting import SETTLE, on_all_processors
 from greybox.diagnosis.search import Candidate, Search, assess_candidate, search
 from greybox.diagnosis.ship import CURRENTS, Ship
+from greybox.diagnosis.thresholds import PROVEN
 from greybox.errors import ExcitationError, GreyboxError
 from greybox.model.disturbances import TURNING
 from greybox.model.structure import Structure
@@ -136,6 +138,7 @@ def from_chosen(
     if fit is None:
         return None
     fit, named = _with_sensors(case, fit, named, hypotheses)
+    fit, named = _with_wind(case, fit, named, hypotheses)
     proof = case.held_out(fit.integrator).prove(plain, fit)
     names = case.problem(fit.integrator).names
     # each is weighed at the end, by leaving it out
@@ -313,6 +316,24 @@ def _with_sensors(
     every = [[*named, *beside], *([[*uncoupled, *defects]] if alike else [])]
     alone = [[*named, h] for h in beside if len(beside) > 1]
     return _best_of(case, fit, named, every) or _best_of(case, fit, named, alone) or (fit, named)
+
+
+def _with_wind(
+    case: DiagnosisProblem, fit: Fit, named: list[Hypothesis], hypotheses: Sequence[Hypothesis]
+) -> tuple[Fit, list[Hypothesis]]:
+    """Return a fit and its causes, with the wind where errors tell from where it blew.
+
+    A weak wind promises less than many a term that takes up what the hull lacks, and would not be
+    among those that are tried.
+    """
+    if any(h.cause == "wind" for h in named):
+        return fit, named
+    problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
+    blowing = [
+        [*named, h] for h in hypotheses
+        if h.cause == "wind" and wind_direction(problem, h, fit, held_out) < PROVEN
+    ]  # fmt: skip
+    return _best_of(case, fit, named, blowing) or (fit, named)
 
 
 def _best_of(

@@ -591,7 +591,7 @@ def _stood(
         without = _without(problem, fit, asked[k])
         hypothesis, weight = asked[k].hypothesis, None
         if found.base.escaped or not without.escaped:
-            weight = standing(problem, hypothesis, fit, pairs, held_out.pairs(without), found.tried)
+            weight = standing(problem, hypothesis, fit, without, held_out, found.tried)
         return without, (weight, held_out.prove(without, fit))
 
     rest = [problem.drop(fit.point, c.hypothesis) for c in asked]

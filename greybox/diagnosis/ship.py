@@ -183,6 +183,16 @@ class LogRun:
         other.log = replace(self.log, channels={**self.log.channels, **channels})
         return other
 
+    def in_wind_turned(self, angle: float) -> LogRun:
+        """Return the log as if the measured wind had blown from further clockwise by an angle."""
+        other, air = copy.copy(self), self.log.air
+        if air is not None:
+            motion = np.column_stack([self.log["u"], self.log["v"]])
+            wind = motion - air
+            turned = np.column_stack(body_to_ned(wind[:, 0], wind[:, 1], angle))
+            other._air, other._last = held(motion - turned, self.integrator), deque(maxlen=_RUNS)
+        return other
+
     def forces(self, vessel: Vessel, wires: tuple[Wire, ...] = ()) -> Array:
         """Return the generalised inputs (N, nu) as the vessel's thrusters give them."""
         for before, same, tau in reversed(self._forces):

@@ -572,7 +572,7 @@ def _standard_errors(
         [max(a for a, o in zip(acting, structure.terms, strict=True) if o.state == t.state)
          for t in structure.terms]
     )  # fmt: skip
-    air = np.array([any(f.signal in ("uq", "vq") for f in t.factors) for t in structure.terms])
+    air = np.array([t.of_air for t in structure.terms])
     floor = np.where(air, 0.0, _FLOOR * most / felt)
     spread = np.array([_SPREAD.get(n, _SPREAD_RUDDER) for n in structure.parameters])
     spread *= 2.0 if hull.several_hulls else 1.0

@@ -192,7 +192,7 @@ class Structure(DisplayMixin):
     @property
     def uses_air(self) -> bool:
         """Whether some term sees the velocity through the air."""
-        return any(f.signal in ("uq", "vq") for t in self.terms for f in t.factors)
+        return any(term.of_air for term in self.terms)
 
     def summary(self) -> str:
         """Return name, equations and source as text."""

@@ -192,6 +192,11 @@ class Term:
         return any(f.signal in _WATER for f in self.factors)
 
     @property
+    def of_air(self) -> bool:
+        """Whether it has the velocity through the air among its factors."""
+        return any(f.signal in _AIR for f in self.factors)
+
+    @property
     def key(self) -> tuple[str, tuple[tuple[str, bool, float, float, float], ...]]:
         """Equation and factors without order: equal for terms that are the same function."""
         return self.state, tuple(

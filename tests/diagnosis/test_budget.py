@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,10 @@ from greybox.diagnosis.budget import (
     REST,
     SENSOR,
     SwitchedOff,
+    averaged,
     error_budget,
+    errors_acting,
+    errors_before,
     errors_without,
     without_share,
 )
@@ -21,8 +25,11 @@ from greybox.diagnosis.builder import by_name, leave_out
 from greybox.diagnosis.diagnose import diagnose
 from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.hypothesis import Hypothesis
+from greybox.diagnosis.point import Point
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.result import BudgetPart
+from greybox.diagnosis.ship import Ship
 from greybox.study.blind import draw
 
 
@@ -193,3 +200,50 @@ def test_a_cause_without_which_no_run_has_bounds_is_said_to_have_no_share() -> N
     (said,) = without_share([part], ["current", "inertia_coupling"])
     assert "no share of the error is told of inertia_coupling" in said
     assert without_share([part], ["current"]) == without_share([], ["current"]) == []
+
+
+def test_where_nothing_acts_late_the_errors_are_those_before(pair: Pair) -> None:
+    before = errors_before([pair], pair.fit, lambda _: {})
+    same = errors_acting([pair], pair.fit, lambda _, ship: ship, lambda _: {})
+    np.testing.assert_allclose(same, before)
+
+
+def test_a_lag_takes_what_the_logs_would_have_without_it() -> None:
+    errors = {}
+    for size in (1.0, 0.0):
+        # one ship in one sea, her propellers late by a lag of 4.8 s or by none
+        trial = draw(np.random.default_rng([5, 78]), ("thruster_lag",), samples=600, size=size)
+        ready = prepare([trial.estimation], [trial.validation], None, "thesis", ["thruster_lag"])
+        base, first = ready.base(), ready.case.first
+        pairs = ready.case.held_out(base.integrator).pairs(base)
+        errors[size] = errors_before(pairs, base, first)
+        if size:
+            value = np.array([trial.truth[0].number("lag")])
+            lag = next(h for h in ready.hypotheses if h.key == "thruster_lag:speed")
+            acting = partial(_acting_as, lag, value)
+            mended = errors_acting(pairs, base, acting, first)
+    late, prompt, mended = ((e**2).sum(axis=0) for e in (errors[1.0], errors[0.0], mended))
+    assert (prompt < 0.8 * late).any()
+    np.testing.assert_allclose(1 - mended / late, 1 - prompt / late, atol=0.1)
+
+
+def _acting_as(hypothesis: Hypothesis, value: np.ndarray, _: Point, ship: Ship) -> Ship:
+    assert hypothesis.apply is not None
+    return hypothesis.apply(ship, value)
+
+
+def test_causes_that_do_each_others_work_share_what_both_take() -> None:
+    base = np.full((5, 3), 2.0)
+    errors = {
+        frozenset({"thruster_lag"}): np.full((5, 3), 1.0),
+        frozenset({"rate_limit"}): np.full((5, 3), 1.5),
+        frozenset({"thruster_lag", "rate_limit"}): np.full((5, 3), 0.5),
+    }
+    lag, rate = (averaged(base, errors, name) for name in ("thruster_lag", "rate_limit"))
+    assert lag is not None
+    assert rate is not None
+    np.testing.assert_allclose(lag + rate, 2.0**2 - 0.5**2)
+    np.testing.assert_allclose(lag, ((2.0**2 - 1.0) + (1.5**2 - 0.5**2)) / 2)
+    # one of the runs leaves every bound
+    errors[frozenset({"rate_limit"})] = np.zeros((0, 3))
+    assert averaged(base, errors, "thruster_lag") is None

@@ -176,9 +176,7 @@ def test_heading_time_and_past_commands_are_no_part_of_the_rival(sailed) -> None
 def test_a_current_stands_because_no_force_of_motion_knows_the_heading(sailed) -> None:
     ready, base, problem, hypothesis, fit = sailed
     held = ready.case.held_out(fit.integrator)
-    found = standing(
-        problem, hypothesis, fit, held.pairs(fit), held.pairs(base), len(ready.hypotheses)
-    )
+    found = standing(problem, hypothesis, fit, base, held, len(ready.hypotheses))
     assert found.stands
     assert found.share is None
     assert found.moved.shape == (len(problem.numbers_of(fit.point, hypothesis)),)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,18 +126,109 @@ def fit_generic_forces(pair: Pair, uses: Sequence[Use]) -> None:
         pair.known.update(zip(asked, _generic_forces(pair, asked), strict=True))
 
 
-def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
-    problem, fit, held, held_fit = pair.problem, pair.fit, pair.held, pair.held_fit
+@dataclass(frozen=True)
+class Rival:
+    """What stands beside a generic force, and that force, along the logs of a fit.
+
+    Parameters
+    ----------
+    rows : tuple of ndarray
+        (N, ny, m) whitened, what each force alone does to the errors of each log.
+    pushers : _Pushers
+        What these m are.
+    knots : ndarray
+        See `knots_of`.
+    left, values, right, scale : ndarray
+        Directions (n, q) of the fit's free numbers in whitened errors, starts counted, and how
+        they are made of them.
+    size : ndarray
+        (m,) that each force is divided by.
+    square, along, toward : ndarray
+        (m, m), (q, m) and (m,) products of the forces with each other, with those directions, and
+        with the errors; the first and the last without what the directions take.
+    alike : float
+        Samples of errors that tell as much as one: those products are divided by it.
+    errors : ndarray
+        (n,) whitened.
+    """
+
+    rows: tuple[Array, ...]
+    pushers: _Pushers
+    knots: Array
+    left: Array
+    values: Array
+    right: Array
+    scale: Array
+    size: Array
+    square: Array
+    along: Array
+    toward: Array
+    alike: float
+    errors: Array
+
+    def likeliest(self, use: Use) -> tuple[Array, Array]:
+        """Return prior deviations (m, k) and shares (m,) of forces, as likely as can be."""
+        mine = self.pushers.used(use)
+        deviations, shares = np.zeros((len(self.size), len(mine))), np.zeros(len(self.size))
+        square = self.square[np.ix_(mine, mine)]
+        deviations[mine], shares[mine] = _likeliest(square, self.toward[mine], self.pushers, use)
+        return deviations, shares
+
+    def taking(self, use: Use = MOTION_AND_COMMANDS) -> Takings:
+        """Return what the free numbers and a generic force take of errors."""
+        deviations, _ = self.likeliest(use)
+        inner = np.eye(deviations.shape[1]) + deviations.T @ self.square @ deviations
+        root = np.linalg.solve(np.linalg.cholesky(inner), deviations.T) / np.sqrt(self.alike)
+        ends = np.cumsum([0, *(part.shape[0] * part.shape[1] for part in self.rows)])
+        lefts = tuple(self.left[one:two] for one, two in pairwise(ends))
+        own = np.concatenate([self.left.T @ self.errors, root @ self.toward * self.alike])
+        return Takings(self.rows, lefts, root / self.size, self.along.T * self.size[:, None], own)
+
+
+@dataclass(frozen=True)
+class Takings:
+    """What a fit's free numbers and a generic force take of whitened errors, log by log.
+
+    Of a product of two columns is left what the product of their shares does not take.
+
+    Parameters
+    ----------
+    rows, lefts : tuple of ndarray
+        (N, ny, m) and (n, q) of each log, see `Rival`.
+    root : ndarray
+        (k, m) of the force's prior.
+    along : ndarray
+        (m, q) products of forces and directions, of all logs.
+    own : ndarray
+        (q + k,) shares of the errors.
+    """
+
+    rows: tuple[Array, ...]
+    lefts: tuple[Array, ...]
+    root: Array
+    along: Array
+    own: Array
+
+    def shares(self, log: int, columns: Array) -> Array:
+        """Return the shares (q + k, c) of whitened columns (N, ny, c) of one log."""
+        flat = columns.reshape(-1, columns.shape[2])
+        free = self.lefts[log].T @ flat
+        by_channel = zip(self.rows[log].transpose(1, 2, 0), columns.transpose(1, 0, 2), strict=True)
+        force = sum(f @ c for f, c in by_channel) - self.along @ free
+        return np.vstack([free, self.root @ force])
+
+
+def rival(problem: Problem, fit: Fit, uses: Sequence[Use]) -> Rival | None:
+    """Return what a generic force does along the logs of a fit.
+
+    None at the edge of stability, where a run has no derivatives.
+    """
     nuisance = stacked(problem.rows(fit.point, fit.noise))
-    free = nuisance.shape[1] - sum(map(len, fit.point.starts))
     with np.errstate(over="ignore", invalid="ignore"):
         scale = np.sqrt((nuisance**2).sum(axis=0))
     scale[scale == 0] = 1.0
-    seen = stacked(held_fit.nu)
-    # a run at the edge of stability has no derivatives
-    none = GenericForce(np.zeros_like(seen), seen, held_fit.errors, np.zeros(free))
     if not np.isfinite(scale).all():
-        return [none for _ in uses]
+        return None
     left, values, right = tall_svd(nuisance / scale, _UNKNOWN)
 
     def any_of(state: str, arguments: frozenset[str]) -> bool:
@@ -145,13 +237,13 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
     knots = knots_of(problem)
     nx, made = len(problem.structure.states), _features(problem, fit, knots)
     pushers = _Pushers.of(made, problem.structure.states, any_of)
-    nu = stacked(fit.nu)
-    nu -= left @ (left.T @ nu)
+    errors = stacked(fit.nu)
+    nu = errors - left @ (left.T @ errors)
     pushed = _pushed(problem, fit, [pushers.alone(m, nx) for m in made])
     whitened = problem.whiten(fit.noise, pushed)
     square, across = _products(whitened, np.column_stack([left, nu]))
     if not np.isfinite(square).all():
-        return [none for _ in uses]
+        return None
     size = np.sqrt(np.diag(square))
     size[size == 0] = 1.0
     size = np.sqrt((size**2 + size[pushers.images] ** 2) / 2)
@@ -159,11 +251,22 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
     # of errors with a memory fewer tell anything new
     alike = correlation_factor(np.concatenate(fit.nu))
     square = (square / np.outer(size, size) - along.T @ along) / alike
-    toward = toward / alike
-    deltas = np.zeros((len(size), len(uses)))
-    for delta, use in zip(deltas.T, uses, strict=True):
-        mine = pushers.used(use)
-        delta[mine] = _likeliest(square[np.ix_(mine, mine)], toward[mine], pushers, use)
+    return Rival(
+        tuple(whitened), pushers, knots, left, values, right, scale, size, square, along,
+        toward / alike, alike, errors,
+    )  # fmt: skip
+
+
+def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
+    problem, fit, held, held_fit = pair.problem, pair.fit, pair.held, pair.held_fit
+    free = len(fit.point.vector()) - sum(map(len, fit.point.starts))
+    seen = stacked(held_fit.nu)
+    none = GenericForce(np.zeros_like(seen), seen, held_fit.errors, np.zeros(free))
+    beside = rival(problem, fit, uses)
+    if beside is None:
+        return [none for _ in uses]
+    pushers, knots, size, nx = beside.pushers, beside.knots, beside.size, len(held.structure.states)
+    deltas = np.column_stack([beside.likeliest(use)[1] for use in uses])
     there = _features(held, held_fit, knots)
     moved = _pushed(
         held, held_fit, [pushers.together(m, nx, deltas / size[:, None]) for m in there]
@@ -177,7 +280,7 @@ def _generic_forces(pair: Pair, uses: Sequence[Use]) -> list[GenericForce]:
     out = []
     for k, delta in enumerate(deltas.T):
         # what the coefficients give back, where they can imitate
-        back = (-((right.T / values) @ (along @ delta)) / scale)[:free]
+        back = (-((beside.right.T / beside.values) @ (beside.along @ delta)) / beside.scale)[:free]
         with np.errstate(over="ignore", invalid="ignore"):
             parts = [
                 columns[:, :, k] + slopes[:, :, :free] @ back
@@ -340,8 +443,8 @@ def _products(parts: Sequence[Array], others: Array) -> tuple[Array, Array]:
     return square, across
 
 
-def _likeliest(square: Array, along: Array, pushers: _Pushers, use: Use) -> Array:
-    """Return coefficients (k,) by the strengths that make the innovations likeliest.
+def _likeliest(square: Array, along: Array, pushers: _Pushers, use: Use) -> tuple[Array, Array]:
+    """Return prior deviations (k, k) that make the innovations likeliest, and coefficients (k,).
 
     Parameters
     ----------
@@ -357,12 +460,12 @@ def _likeliest(square: Array, along: Array, pushers: _Pushers, use: Use) -> Arra
     mine = pushers.used(use)
     tried = [pushers.deviations(mine, *way) for way in ways]
     found = [(_ridge(root.T @ square @ root, root.T @ along), root) for root in tried]
-    (_, best), root = min(found, key=lambda f: f[0][0])
-    return np.asarray(root @ best)
+    (_, strength, best), root = min(found, key=lambda f: f[0][0])
+    return strength * root, np.asarray(root @ best)
 
 
-def _ridge(square: Array, along: Array) -> tuple[float, Array]:
-    """Return −2 log of the marginal likelihood, constants apart, and coefficients (k,).
+def _ridge(square: Array, along: Array) -> tuple[float, float, Array]:
+    """Return −2 log of the marginal likelihood, constants apart, the strength, coefficients (k,).
 
     Parameters
     ----------
@@ -377,4 +480,4 @@ def _ridge(square: Array, along: Array) -> tuple[float, Array]:
     costs = (share**2 / grown + np.log(grown)).sum(axis=1)
     best = int(np.argmin(costs))
     shrunk = _STRENGTHS[best] ** 2 * values / grown[best]
-    return float(costs[best]), right.T @ (shrunk * share)
+    return float(costs[best]), float(_STRENGTHS[best]), right.T @ (shrunk * share)

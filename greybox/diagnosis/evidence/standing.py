@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.evidence.held_out import Pair, Proof, proof_of
+from greybox.diagnosis.evidence.held_out import HeldOut, Pair, Proof, proof_of
 from greybox.diagnosis.evidence.remainder import (
     MOTION_AND_COMMANDS,
     Use,
@@ -16,6 +16,7 @@ from greybox.diagnosis.evidence.remainder import (
     fit_generic_forces,
     generic_force,
 )
+from greybox.diagnosis.evidence.wind_direction import wind_direction
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.point import Fit, Point
@@ -68,6 +69,8 @@ class Standing:
         Causes that were scored, of which this is one, each as often as a moment was sought for it.
     sought : bool
         Whether it is the best of many moments.
+    direction : float
+        p-value of errors that know nothing of the direction of a measured wind.
     """
 
     beyond: Proof
@@ -80,13 +83,16 @@ class Standing:
     known: float = PROVEN
     tried: int = 1
     sought: bool = False
+    direction: float = 1.0
 
     @property
     def stands(self) -> bool:
         """Whether the cause explains what no generic force explains as well."""
         gains = self.beyond.gain > 0 and self.beyond.p_value < self.level
         own = self.share is not None and self.share >= OWN_SHARE and self.half < self.level
-        return (gains or own) and self.clear < PROVEN and self._sure
+        beside = (gains or own) and self.clear < PROVEN
+        # no force of motion and commands knows from where the wind blows
+        return (beside or self.direction < PROVEN) and self._sure
 
     @property
     def _sure(self) -> bool:
@@ -98,21 +104,21 @@ class Standing:
         return self.told < self.known
 
 
-def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequence[Pair],
-             without: Sequence[Pair], tried: int) -> Standing:  # fmt: skip
+def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, without_it: Fit,
+             held_out: HeldOut, tried: int) -> Standing:  # fmt: skip
     """Weigh a cause against a generic force.
 
     Parameters
     ----------
     problem : Problem
     hypothesis : Hypothesis
-    with_it : Fit
-        With the cause in force.
-    pairs, without : sequence of Pair
-        That fit, and the one without the cause, on what is held out.
+    with_it, without_it : Fit
+        With the cause in force, and without it.
+    held_out : HeldOut
     tried : int
         Causes that were scored.
     """
+    pairs, without = held_out.pairs(with_it), held_out.pairs(without_it)
     moved, clear, told = _moved(problem, hypothesis, with_it, pairs)
     level = level_of(with_it)
     sought = any(p.reach > 0 for p in hypothesis.parameters)
@@ -135,10 +141,16 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, pairs: Sequ
         gained, could = plain - own, plain - generic
         share = float(gained.sum() / could.sum()) if could.sum() > 0 else np.inf
         half = proof_of(gained - LEAST_SHARE * could).p_value
+    direction = 1.0
+    if any(parse_term(n).of_air for n in hypothesis.columns if n not in CURRENTS):
+        direction = wind_direction(problem, hypothesis, without_it, held_out)
     # every ship has such terms; that a log or the vessel file is wrong, or what heading, time and
     # earlier commands do, must be surer
-    known = SAME if hypothesis.apply is None and share is not None else PROVEN
-    return Standing(beyond, share, half, moved, clear, told, level, known, tried, sought)
+    of_hull = hypothesis.apply is None and share is not None
+    known = SAME if of_hull or direction < PROVEN else PROVEN
+    return Standing(
+        beyond, share, half, moved, clear, told, level, known, tried, sought, direction
+    )  # fmt: skip
 
 
 def level_of(fit: Fit) -> float:
