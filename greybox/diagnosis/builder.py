@@ -428,7 +428,7 @@ class DiagnosisBuilder:
         elif sensors.turned or sensors.late:
             out.append(
                 "the gain is of the motion as the log shows it; greybox compare measures the fit "
-                "of the motion that the corrected sensors show, which is another one."
+                "of the motion that the corrected sensors show."
             )
         kept = kept_without_name(self.found)
         if kept:

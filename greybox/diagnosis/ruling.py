@@ -14,7 +14,7 @@ from greybox.diagnosis.point import Fit
 from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain, file_word
 from greybox.diagnosis.search import Candidate, Search, left_to_motion
 from greybox.diagnosis.ship import LogRun
-from greybox.diagnosis.symptoms import coloured, word
+from greybox.diagnosis.symptoms import moved_beside, word
 from greybox.diagnosis.thresholds import (
     APART,
     BESIDE,
@@ -292,8 +292,11 @@ def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str, kept:
     # of the logs that it was fitted to, or of the first part of them
     fit = final if pairs[0].fit.escaped else problem.forgetful(pairs[0].fit, np.inf)
     # of a line no colour tells
-    moved = "" if waves else coloured(fit, problem.runs[0].outputs)
-    tail = f" In these logs {moved}." if moved else ""
+    moved = "" if waves else moved_beside(fit, problem.runs[0].outputs)
+    mover = "In these logs something that the model lacks moves"
+    if not why:
+        mover = "Gusts, or forces as short-lived, move"
+    tail = f" {mover} {moved}." if moved else ""
     if why:
         return f"What is left is not only noise: {why}.{tail}"
     missed = {s: m for s, m in _missed(pairs, waves).items() if m > NEAR}

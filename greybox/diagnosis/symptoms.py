@@ -130,14 +130,12 @@ def _conditions(run: LogRun, x: Array) -> Iterator[tuple[str, Mask]]:
             yield f"while {name} is in its lowest quarter", value < np.quantile(value, 0.25)
 
 
-def coloured(fit: Fit, outputs: Sequence[str]) -> str | None:
-    """Return what moves the ship beside the model, in words; None where little does."""
+def moved_beside(fit: Fit, outputs: Sequence[str]) -> str:
+    """Return what is moved by more than the model, in words; nothing where little is."""
     found = []
     for group in fit.noise.groups:
         if group.share > SEEN:
             memory = group.remembered
             tail = f" with a memory of {memory:.0f} samples" if memory > 2 else ""
             found.append(f"{word(outputs[group.outputs[0]])}{tail}")
-    if not found:
-        return None
-    return f"something that the model lacks moves {' and '.join(found)}"
+    return " and ".join(found)
