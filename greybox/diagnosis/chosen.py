@@ -324,16 +324,30 @@ def _with_wind(
     """Return a fit and its causes, with the wind where errors tell from where it blew.
 
     A weak wind promises less than many a term that takes up what the hull lacks, and would not be
-    among those that are tried.
+    among those that are tried. A current takes much of what a steady wind does, so that the wind is
+    asked for in its place, too; so is all of the wind in the place of those of its terms that were
+    chosen beside one.
     """
-    if any(h.cause == "wind" for h in named):
-        return fit, named
     problem, held_out = case.problem(fit.integrator), case.held_out(fit.integrator)
+    calm = [h for h in named if h.cause != "wind"]
+    still = [h for h in calm if h.cause != "current"]
+    if len(calm) < len(named):
+        winds = [h for h in hypotheses if h.cause == "wind" and h not in named]
+        ways = [[*still, h] for h in winds] if len(still) < len(calm) else []
+        return _best_of(case, fit, named, ways) or (fit, named)
+    fits = [fit]
+    if len(still) < len(named):
+        point = fit.point
+        for hypothesis in named:
+            point = point if hypothesis in still else problem.drop(point, hypothesis)
+        fits.append(problem.settle(problem.fit(point, fit.noise), 1))
     blowing = [
-        [*named, h] for h in hypotheses
-        if h.cause == "wind" and wind_direction(problem, h, fit, held_out) < PROVEN
+        h for h in hypotheses
+        if h.cause == "wind"
+        and len(fits) * min(wind_direction(problem, h, f, held_out) for f in fits) < PROVEN
     ]  # fmt: skip
-    return _best_of(case, fit, named, blowing) or (fit, named)
+    ways = [[*causes, h] for h in blowing for causes in (named, still)[: len(fits)]]
+    return _best_of(case, fit, named, ways) or (fit, named)
 
 
 def _best_of(

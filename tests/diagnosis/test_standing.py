@@ -11,11 +11,12 @@ from greybox.diagnosis.evidence.features import features
 from greybox.diagnosis.evidence.held_out import Proof
 from greybox.diagnosis.evidence.remainder import (
     ANYTHING,
+    MOTION_AIR_AND_COMMANDS,
     MOTION_AND_COMMANDS,
     _Pushers,
     generic_force,
 )
-from greybox.diagnosis.evidence.standing import Standing, _own_arguments, standing
+from greybox.diagnosis.evidence.standing import Standing, _own_arguments, _rival, standing
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.search import FIRST, Search, _stands, weighed
 from greybox.diagnosis.thresholds import PROVEN, SAME
@@ -130,6 +131,7 @@ def test_in_the_mirror_of_port_and_starboard_each_feature_becomes_its_image() ->
         run = SimpleNamespace(
             states=("u", "v", "r"), log=log, run=lambda *_: SimpleNamespace(x=x * sign),
             forces=lambda *_: tau * sign, sample_time=0.5, time=np.arange(n), duration=n - 1,
+            air_measured=False,
             structure=SimpleNamespace(inputs=("taux", "tauy", "taun")),
         )  # fmt: skip
         return features(run, fit, x[0], np.full((3, 1), 0.5))
@@ -241,3 +243,22 @@ def test_a_search_without_causes_is_left_as_it_is(sailed) -> None:
     ready, base, *_ = sailed
     found = Search(base, base, (), (), 1)
     assert weighed(ready.case, found) == found
+
+
+def test_beside_a_measured_wind_a_current_is_weighed_against_forces_of_the_air_too() -> None:
+    trial = draw(np.random.default_rng([3, 4]), ("wind",), samples=400)
+    ready = prepare([trial.estimation], [trial.validation], None, "thesis", ["wind", "current"])
+    base = ready.base()
+    problem = ready.case.problem(base.integrator)
+    by_cause = {a.cause: a for a in ready.hypotheses}
+    assert _rival(problem, by_cause["current"]) is MOTION_AIR_AND_COMMANDS
+    assert _rival(problem, by_cause["wind"]) is MOTION_AND_COMMANDS
+    made = features(problem.runs[0], base, base.point.starts[0], np.zeros((3, 0)))
+    of_air = [k for k, a in enumerate(made.arguments) if a == {"air"}]
+    ahead, abeam = trial.estimation["u_q"], trial.estimation["v_q"]
+    assert any(np.array_equal(made.values[:, k], abeam * np.abs(ahead)) for k in of_air)
+    # in the mirror the air comes from the other side
+    signs = {made.signs[k] for k in of_air if np.array_equal(made.values[:, k], abeam)}
+    assert signs == {-1.0}
+    assert not any(ANYTHING.takes("u", made.arguments[k]) for k in of_air)
+    assert all(MOTION_AIR_AND_COMMANDS.takes("u", made.arguments[k]) for k in of_air)

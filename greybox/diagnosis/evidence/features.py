@@ -28,7 +28,7 @@ _KNOTS = (0.3, 0.6, 0.85)
 # cosine of an angle that counts as sideways
 _SIDEWAYS = 1e-9
 # what no smooth force of motion and present commands is a function of
-HEADING, TIME, PAST = "heading", "time", "past commands"
+HEADING, TIME, PAST, AIR = "heading", "time", "past commands", "air"
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Features:
         (N, G)
     arguments : tuple of frozenset of str
         (G,) signals that each is a function of: states, columns of commands, and `HEADING`,
-        `TIME`, `PAST`.
+        `TIME`, `PAST`, and `AIR` where the velocity through it was measured.
     signs, images : ndarray
         (G,) in the mirror each becomes the one at its index here, times its sign; the sign is 0
         where it has no image.
@@ -135,6 +135,14 @@ def features(run: LogRun, fit: Fit, start: Array, knots: Array) -> Features:
         add(np.sin(k * psi), 0, HEADING)
     add(states[0] * np.cos(psi), 0, HEADING)
     add(states[0] * np.sin(psi), 0, HEADING)
+    air = log.air if run.air_measured else None
+    if air is not None:
+        ahead, abeam = air.T
+        for value, sign in (
+            (ahead, 1), (abeam, -1), (np.abs(ahead) * ahead, 1), (np.abs(abeam) * abeam, -1),
+            (np.abs(ahead) * abeam, -1), (ahead * abeam, -1), (np.abs(abeam) * ahead, 1),
+        ):  # fmt: skip
+            add(value, sign, AIR)
     later = run.time > run.duration / 2
     for column, sign in zip((*states, *tau.T), (*own_signs, *forces), strict=True):
         add(later * column, sign, TIME)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.diagnosis.evidence.features import (
+    AIR,
     HEADING,
     PAST,
     TIME,
@@ -50,7 +51,7 @@ _BROKEN = (0.01, 0.1, 0.3, 1.0, 3.0)
 # which a direction is not known
 _UNKNOWN = 1e-8
 # what no smooth force of motion and present commands is a function of
-_OTHERS = frozenset({HEADING, TIME, PAST})
+_OTHERS = frozenset({HEADING, TIME, PAST, AIR})
 
 
 @dataclass(frozen=True)
@@ -70,10 +71,12 @@ class Use:
     parity: int = 0
 
 
-# every feature in every equation
-ANYTHING = Use(lambda state, arguments: True)
+# every feature but those of the air in every equation
+ANYTHING = Use(lambda state, arguments: AIR not in arguments)
 # functions of motion through the water and of present commands
 MOTION_AND_COMMANDS = Use(lambda state, arguments: not arguments & _OTHERS)
+# those, and of the velocity through the air: a steady wind pushes as a current does
+MOTION_AIR_AND_COMMANDS = Use(lambda state, arguments: not arguments & (_OTHERS - {AIR}))
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from greybox.diagnosis.evidence.held_out import HeldOut, Pair, Proof, proof_of
 from greybox.diagnosis.evidence.remainder import (
+    MOTION_AIR_AND_COMMANDS,
     MOTION_AND_COMMANDS,
     Use,
     contributions_beside,
@@ -119,7 +120,8 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, without_it:
         Causes that were scored.
     """
     pairs, without = held_out.pairs(with_it), held_out.pairs(without_it)
-    moved, clear, told = _moved(problem, hypothesis, with_it, pairs)
+    rival = _rival(problem, hypothesis)
+    moved, clear, told = _moved(problem, hypothesis, with_it, pairs, rival)
     level = level_of(with_it)
     sought = any(p.reach > 0 for p in hypothesis.parameters)
     tried *= MOMENTS if sought else 1
@@ -129,9 +131,9 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, without_it:
         return Standing(proof, None, 1.0, moved, clear, told, level, PROVEN, tried, sought)
     use = _own_arguments(problem, hypothesis)
     for pair in without:
-        fit_generic_forces(pair, [MOTION_AND_COMMANDS, *([] if use is None else [use])])
-    beside = [contributions_beside(p) for p in pairs]
-    beyond = proof_of(np.concatenate([contributions_beside(p) for p in without])
+        fit_generic_forces(pair, [rival, *([] if use is None else [use])])
+    beside = [contributions_beside(p, rival) for p in pairs]
+    beyond = proof_of(np.concatenate([contributions_beside(p, rival) for p in without])
                       - np.concatenate(beside))  # fmt: skip
     share, half = None, 1.0
     if use is not None:
@@ -153,13 +155,22 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, without_it:
     )  # fmt: skip
 
 
+def _rival(problem: Problem, hypothesis: Hypothesis) -> Use:
+    """Return what a hypothesis is weighed against."""
+    measured = all(run.air_measured for run in problem.runs)
+    return (
+        MOTION_AIR_AND_COMMANDS if measured and set(hypothesis.columns) & {*CURRENTS}
+        else MOTION_AND_COMMANDS
+    )  # fmt: skip
+
+
 def level_of(fit: Fit) -> float:
     """Return the significance that a gain on held-out logs must have."""
     return PROVEN if fit.noise.coloured else AS_CHOSEN
 
 
 def _moved(
-    problem: Problem, hypothesis: Hypothesis, fit: Fit, pairs: Sequence[Pair]
+    problem: Problem, hypothesis: Hypothesis, fit: Fit, pairs: Sequence[Pair], rival: Use
 ) -> tuple[Array, float, float]:
     """Return how far a hypothesis's numbers move, and two p-values of their null."""
     from scipy.special import chdtrc
@@ -168,7 +179,7 @@ def _moved(
     bounded = [p for p in pairs if not (p.fit.escaped or p.held_fit.escaped)]
     if not where or not bounded:
         return np.zeros(len(where)), 0.0, 0.0
-    every = np.mean([generic_force(p).moved for p in bounded], axis=0)
+    every = np.mean([generic_force(p, rival).moved for p in bounded], axis=0)
     scatter = np.sqrt(np.mean([_scatter(p, hypothesis) for p in bounded], axis=0))
     whole = np.hypot(every[where], scatter)
     away, own, along = problem.effect(fit, hypothesis)
