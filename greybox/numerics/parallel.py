@@ -42,8 +42,8 @@ _ANSWER, _PATIENCE = 10.0, 60.0
 # seconds between looks at whether processes still run, and looks that find none in a row before it
 # counts: ended ones are about to be replaced
 _LOOK, _LOOKS = 0.5, 10
-# seconds for which idle processes are kept: one that ends just when the next work is given is told as
-# a fault on the terminal
+# seconds for which idle processes are kept: one that ends just when the next work is given is told
+# as a fault on the terminal
 _KEPT = 300
 # names under which Dask reports on what ends as one sentence here
 _LOGGERS = ("distributed", "tornado.application")
