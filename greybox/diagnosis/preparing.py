@@ -17,6 +17,7 @@ from greybox.diagnosis.ship import CURRENTS, Change, derived_motions
 from greybox.errors import LogError, UsageError, suggestion
 from greybox.estimation.informative import require_commands, require_motion
 from greybox.model.catalogue import for_inputs, get_structure, structure_for
+from greybox.model.disturbances import WIND_TERMS
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
 from greybox.regression.regression import common_sample_time
@@ -32,7 +33,6 @@ Array = NDArray[np.float64]
 
 # samples that a diagnosis needs in every log
 SHORTEST = 120
-_WIND_TERMS = ("Wuu", "Wvv", "Wuv")
 
 
 @dataclass(frozen=True)
@@ -240,7 +240,7 @@ def _structure(name: str, logs: Sequence[TrialLog], model: ManoeuvringModel | No
     # also where a name takes terms away or adds some
     get_structure(name)
     structure = structure_for(name, inputs)
-    still = [t for t in _WIND_TERMS if t in structure.parameters]
+    still = [t for t in WIND_TERMS if t in structure.parameters]
     return for_inputs(structure.without(*still), inputs) if still else structure
 
 

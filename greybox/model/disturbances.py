@@ -19,6 +19,8 @@ DisturbanceKind = Literal["marine", "additive", "none"]
 
 CURRENT = ("current_north", "current_east")
 WIND = ("wind_north", "wind_east")
+# what a wind does in (3.51)
+WIND_TERMS = ("Wuu", "Wvv", "Wuv")
 # signals of a ship in a current and a wind -> how equations show them
 SHOWN = {"u": "u_r", "v": "v_r", "uq": "u_q", "vq": "v_q", "uc": "u_c", "vc": "v_c"}
 # what the velocity over ground gains in a sample because the water's turns in body axes, r v_c

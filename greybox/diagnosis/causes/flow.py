@@ -9,7 +9,7 @@ import numpy as np
 from greybox.diagnosis.causes.cause import Cause, Context
 from greybox.diagnosis.causes.hull import term_parameters
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
-from greybox.model.disturbances import TURNING
+from greybox.model.disturbances import TURNING, WIND_TERMS
 from greybox.notebook import with_error
 
 # no current is stronger [m/s]
@@ -46,7 +46,7 @@ class Current(Cause):
                 columns=("current_north", "current_east"),
                 # in still air the hull feels its velocity over ground, not through the water
                 co_freed=context.lacking(
-                    *TURNING, *(() if context.has_wind else ("Wuu", "Wvv", "Wuv"))
+                    *TURNING, *(() if context.has_wind else WIND_TERMS)
                 ),
             ),
         )  # fmt: skip
@@ -75,7 +75,7 @@ class Wind(Cause):
 
     def hypotheses(self, context: Context) -> Sequence[Hypothesis]:
         """Return the lacking wind terms together, where the wind was measured."""
-        lacking = context.lacking("Wuu", "Wvv", "Wuv") if context.has_wind else ()
+        lacking = context.lacking(*WIND_TERMS) if context.has_wind else ()
         if not lacking:
             return ()
         return (Hypothesis(self.id, self.id, term_parameters(lacking, context), columns=lacking),)

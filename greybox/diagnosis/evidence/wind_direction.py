@@ -5,7 +5,8 @@ much of it. A wind that pushes the ship explains most where it is as it was meas
 all angles at which it explains as much is the p-value of a test that no misfit of motion and
 commands upsets (a randomisation test: Fisher, 1935; Lehmann and Romano, 2005, section 15.2). Each
 log's wind is turned by itself; those of logs that set out on about the same angle to the wind, as
-crews do, are turned together, since the same manoeuvre would show the same misfit there.
+crews do, are turned together, since the same manoeuvre would show the same misfit there. All of
+the wind's force is turned: the terms that were chosen are those that the same errors asked for.
 """
 
 from __future__ import annotations
@@ -20,10 +21,12 @@ from numpy.typing import NDArray
 from greybox.diagnosis.evidence.held_out import HeldOut, OtherLogs
 from greybox.diagnosis.evidence.remainder import MOTION_AND_COMMANDS, Takings, rival
 from greybox.diagnosis.fitting import Problem, measured
-from greybox.diagnosis.hypothesis import Hypothesis
+from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import LogRun
+from greybox.model.disturbances import WIND_TERMS
+from greybox.model.terms import parse_term
 from greybox.trial.segments import of_one_log
 
 Array = NDArray[np.float64]
@@ -61,8 +64,22 @@ def wind_direction(
     beside = rival(problem, without, [MOTION_AND_COMMANDS])
     if beside is None:
         return 1.0
-    gains = _gains(problem, hypothesis, without, beside.taking())
+    gains = _gains(problem, _whole(problem, hypothesis, without), without, beside.taking())
     return float((gains >= gains[0]).mean()) if np.isfinite(gains).all() else 1.0
+
+
+def _whole(problem: Problem, hypothesis: Hypothesis, without: Fit) -> Hypothesis:
+    """Return the hypothesis with those terms of a wind that it lacks."""
+    there = {*hypothesis.columns, *(problem.names[k] for k in without.point.places)}
+    more = [name for name in WIND_TERMS if name in problem.names and name not in there]
+    numbers = [
+        Parameter(n, "", 0.0, high=0.0 if parse_term(n).dissipates else np.inf) for n in more
+    ]
+    return replace(
+        hypothesis,
+        columns=(*hypothesis.columns, *more),
+        parameters=(*hypothesis.parameters, *numbers),
+    )
 
 
 def _with_others(problem: Problem, fit: Fit, held_out: OtherLogs) -> tuple[Problem, Fit]:
