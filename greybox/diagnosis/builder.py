@@ -146,7 +146,7 @@ class DiagnosisBuilder:
         if weighed is not None and weighed.direction < PROVEN:
             less = 100 * (1 - weighed.direction)
             evidence += f", and {less:.1f} % of winds turned at random would explain less"
-        if weighed is not None and weighed.told >= PROVEN:
+        if weighed is not None and weighed.stands and weighed.told >= PROVEN:
             evidence += "; that it is there is proven, its size is not"
         return Found(
             candidate.hypothesis.id, candidate.hypothesis.key, cause.title, quantities,
