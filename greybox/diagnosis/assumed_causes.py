@@ -91,7 +91,7 @@ def _likeliest(
     near = [a for a in hypotheses if not a.refit_from_scratch]
     scores, forgetful = promises(problem, fit, near)
     asked = [*((fit, score) for score in scores[:_FORMS]), *forgetful]
-    fits = [(a, f) for a, f, _ in likelier(refits(problem, asked, lambda _: None))]
+    fits = likelier(refits(problem, asked))
     if not fit.point.hypotheses:
         # coefficients of their own forget the causes before: only the first can have them
         fits += case.restart(fit, hypotheses, [s.hypothesis for s in scores if s.gain == -np.inf])

@@ -14,7 +14,7 @@ split.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import factorial
 
@@ -39,6 +39,8 @@ SENSOR, MOTION, SLOW, WAVES, REST = (
     "sensor noise", "motion and commands", "slow force", "waves", "not split",
 )  # fmt: skip
 _DRAWS = 1000
+# logs to fit to, logs that are held out, and where to begin
+_Part = tuple[Sequence[LogRun], Sequence[LogRun], Sequence[Point]]
 # takes a cause, or terms, out of a point of the extended model
 Drop = Callable[[Problem, Point], Point]
 
@@ -86,12 +88,9 @@ def errors_before(
     ndarray
         (N, nx), of all that is held out; empty where a run leaves every bound.
     """
-    found = [
-        _nearest(p.problem.runs, p.held.runs, _starts(p.problem.runs, before, None, first))
-        for p in pairs
-    ]
-    errors = [_states(p.held, p.held_fit) for p in found if p is not None]
-    return np.concatenate(errors) if errors and all(found) else np.zeros((0, 0))
+    return _errors(
+        (p.problem.runs, p.held.runs, _starts(p.problem.runs, before, None, first)) for p in pairs
+    )
 
 
 def errors_without(
@@ -118,20 +117,18 @@ def errors_without(
     ndarray
         (N, nx), of all that is held out; empty where a run leaves every bound.
     """
-    out = []
-    for pair in final:
-        less = drop(pair.problem, pair.fit.point)
-        logs = _runs_without(pair.problem, pair.fit.point, [pair.fit.point.ship], [less.ship])
-        held = _runs_without(
-            pair.held, pair.held_fit.point, change_scenarios(pair.fit.point), change_scenarios(less)
-        )
-        found = None
-        if logs and held:
-            found = _nearest(logs, held, _starts(logs, before, pair.fit, first))
-        if found is None:
-            return np.zeros((0, len(pair.held.structure.states)))
-        out.append(_states(found.held, found.held_fit))
-    return np.concatenate(out)
+
+    def parts() -> Iterator[_Part]:
+        for pair in final:
+            point = pair.fit.point
+            less = drop(pair.problem, point)
+            logs = _runs_without(pair.problem, point, [point.ship], [less.ship])
+            held = _runs_without(
+                pair.held, pair.held_fit.point, change_scenarios(point), change_scenarios(less)
+            )
+            yield logs, held, _starts(logs, before, pair.fit, first) if logs else []
+
+    return _errors(parts())
 
 
 def errors_acting(
@@ -154,15 +151,14 @@ def errors_acting(
     ndarray
         (N, nx), of all that is held out; empty where a run leaves every bound.
     """
-    out = []
-    for pair in final:
-        begun = _starts(pair.problem.runs, before, pair.fit, first)
-        late = [replace(p, base=acting(pair.fit.point, p.base)) for p in begun]
-        found = _nearest(pair.problem.runs, pair.held.runs, late)
-        if found is None:
-            return np.zeros((0, len(pair.held.structure.states)))
-        out.append(_states(found.held, found.held_fit))
-    return np.concatenate(out)
+
+    def parts() -> Iterator[_Part]:
+        for pair in final:
+            begun = _starts(pair.problem.runs, before, pair.fit, first)
+            late = [replace(p, base=acting(pair.fit.point, p.base)) for p in begun]
+            yield pair.problem.runs, pair.held.runs, late
+
+    return _errors(parts())
 
 
 def averaged(base: Array, errors: Mapping[frozenset[str], Array], name: str) -> Array | None:
@@ -238,34 +234,57 @@ def _starts(
     return begun
 
 
-def _nearest(runs: Sequence[LogRun], held: Sequence[LogRun], begun: Sequence[Point]) -> Pair | None:
-    """Return the best predicting of fits from several points; None where none has bounds.
+def _errors(parts: Iterable[_Part]) -> Array:
+    """Return the held-out errors (N, nx) of all parts; empty where a run leaves every bound.
+
+    The parts are of the same logs: where the first one was begun best, the others are begun.
+    """
+    out: list[Array] = []
+    best = None
+    for runs, held, begun in parts:
+        if not runs or not held:
+            return np.zeros((0, 0))
+        found = None if best is None else _nearest(runs, held, [begun[best]])
+        found = found or _nearest(runs, held, begun)
+        if found is None:
+            return np.zeros((0, 0))
+        pair, place = found
+        best = place if best is None else best
+        out.append(_states(pair.held, pair.held_fit))
+    return np.concatenate(out)
+
+
+def _nearest(
+    runs: Sequence[LogRun], held: Sequence[LogRun], begun: Sequence[Point]
+) -> tuple[Pair, int] | None:
+    """Return the best predicting of fits from several points, and where it began.
+
+    None where none has bounds.
 
     Errors are weighed by their size: a fit that is weighed by their colour forgets what is slow
     in them, and where much is missing it may end with runs that are farther off than no motion.
     Where none of them predicts within bounds, the first point's coefficients are kept.
     """
     problem, other = Problem(runs, "free run"), Problem(held, "free run")
-    found: list[Pair] = []
+    found: list[tuple[Pair, int]] = []
 
-    def add(fit: Fit) -> None:
+    def add(fit: Fit, k: int) -> None:
         shown = fit if fit.escaped else other.fit_starts(fit.point, fit.noise)
         if not shown.escaped:
-            found.append(Pair(problem, fit, other, shown))
+            found.append((Pair(problem, fit, other, shown), k))
 
-    tried = [(point, problem.errors(point)) for point in begun]
-    bounded = [(p, errors) for p, errors in tried if all(np.isfinite(e).all() for e in errors)]
-    for point, errors in bounded:
-        add(problem.settle(problem.fit(point, problem.noise_of(errors, point)), 2))
+    def missed(pair: Pair) -> float:
+        return float(np.log((_states(pair.held, pair.held_fit) ** 2).sum(axis=0)).sum())
+
+    tried = [(k, point, problem.errors(point)) for k, point in enumerate(begun)]
+    bounded = [one for one in tried if all(np.isfinite(e).all() for e in one[-1])]
+    for k, point, errors in bounded:
+        add(problem.settle(problem.fit(point, problem.noise_of(errors, point)), 2), k)
     if not found and bounded:
-        point, errors = bounded[0]
-        add(problem.fit(point, problem.noise_of(errors, point), most=0))
+        k, point, errors = bounded[0]
+        add(problem.fit(point, problem.noise_of(errors, point), most=0), k)
     # a fit may end before a hill beyond which it would predict better
-    return min(
-        found,
-        key=lambda p: float(np.log((_states(p.held, p.held_fit) ** 2).sum(axis=0)).sum()),
-        default=None,
-    )
+    return min(found, key=lambda one: missed(one[0]), default=None)
 
 
 def error_budget(

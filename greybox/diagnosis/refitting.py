@@ -42,18 +42,11 @@ def refit(problem: Problem, fit: Fit, score: Score) -> Fit:
     return problem.settle(problem.scan(first, score.hypothesis), 1, fit.cost)
 
 
-def refits(
-    problem: Problem, asked: Sequence[tuple[Fit, Score]], tell: Callable[[Fit], Told]
-) -> list[tuple[Hypothesis, Fit, Told]]:
-    """Return the fits with one more hypothesis each, and what is told of each."""
+def refits(problem: Problem, asked: Sequence[tuple[Fit, Score]]) -> list[tuple[Hypothesis, Fit]]:
+    """Return the fits with one more hypothesis each."""
     points = [problem.add(fit.point, score.hypothesis) for fit, score in asked]
-
-    def work(k: int) -> tuple[Fit, Told]:
-        fit = refit(problem, *asked[k])
-        return fit, tell(fit)
-
-    found = on_all_processors(points, work)
-    return [(score.hypothesis, *one) for (_, score), one in zip(asked, found, strict=True)]
+    found = on_all_processors(points, lambda k: (refit(problem, *asked[k]), None))
+    return [(score.hypothesis, fit) for (_, score), (fit, _) in zip(asked, found, strict=True)]
 
 
 def on_all_processors(
@@ -144,14 +137,12 @@ def promises(
     return plain[1], later
 
 
-def likelier(
-    fits: Sequence[tuple[Hypothesis, Fit, Told]],
-) -> list[tuple[Hypothesis, Fit, Told]]:
+def likelier(fits: Sequence[tuple[Hypothesis, Fit]]) -> list[tuple[Hypothesis, Fit]]:
     """Return the likeliest fit of each hypothesis."""
-    best: dict[str, tuple[Hypothesis, Fit, Told]] = {}
-    for hypothesis, fit, told in fits:
+    best: dict[str, tuple[Hypothesis, Fit]] = {}
+    for hypothesis, fit in fits:
         if hypothesis.key not in best or fit.cost < best[hypothesis.key][1].cost:
-            best[hypothesis.key] = (hypothesis, fit, told)
+            best[hypothesis.key] = (hypothesis, fit)
     return list(best.values())
 
 

@@ -45,6 +45,7 @@ from greybox.diagnosis.thresholds import (
     WORTH,
 )
 from greybox.model.run.step import Integrator
+from greybox.numerics.parallel import map_forked
 
 Array = NDArray[np.float64]
 
@@ -52,6 +53,8 @@ Array = NDArray[np.float64]
 _THRUST = ("Xmu", "Ymu", "Nmu")
 # other causes that are tried in the place of one of several
 _INSTEAD = 2
+# share of the best fall of −2 log L from which on held-out logs are asked at once
+_ASKED_FIRST = 0.5
 
 _log = logging.getLogger(__name__)
 
@@ -342,21 +345,21 @@ def take_step(
     near = [a for a in left if not a.refit_from_scratch]
     scores, forgetful = promises(problem, fit, near)
     asked = [*((fit, score) for score in shortlist(scores)), *forgetful]
-    held_out.contributions(fit)
-    fits = refits(problem, asked, lambda found: held_out.prove(fit, found))
-    again = case.from_far(fit, near, {s.hypothesis.key: s.gain for s in scores})
+    fits = refits(problem, asked)
+    fits += case.from_far(fit, near, {s.hypothesis.key: s.gain for s in scores})
     if not causes:
-        again += case.restart(fit, left, [s.hypothesis for s in scores if s.gain == -np.inf])
-    fits += [(hypothesis, found, held_out.prove(fit, found)) for hypothesis, found in again]
+        fits += case.restart(fit, left, [s.hypothesis for s in scores if s.gain == -np.inf])
     fits = likelier(fits)
-    candidates = sorted(
-        (
+    candidates: list[Candidate] = []
+    for some in _likely_first(fits, held_out, fit):
+        proofs = proven(held_out, fit, [found for _, found in some])
+        candidates += [
             assess_candidate(proof, fit, found, hypothesis, len(left) + passed_over, problem.names)
-            for hypothesis, found, proof in fits
-        ),
-        key=_bic,
-    )
-    candidates = _beside_others(candidates)
+            for (hypothesis, found), proof in zip(some, proofs, strict=True)
+        ]
+        candidates = _beside_others(sorted(candidates, key=_bic))
+        if any(c.holds for c in candidates):
+            break
     sure = (_wald_checked(case, c) for c in candidates if c.holds)
     taken = next((c for c in sure if c.holds), None)
     if taken is not None and not enough(taken.fit):
@@ -367,6 +370,30 @@ def take_step(
         if not taken.holds:
             taken = None
     return Step(fit, tuple(scores), tuple(candidates), taken)
+
+
+def _likely_first(
+    fits: Sequence[tuple[Hypothesis, Fit]], held_out: HeldOut, before: Fit
+) -> list[list[tuple[Hypothesis, Fit]]]:
+    """Return fits with one more cause in the parts in which held-out logs are asked of them.
+
+    One that gains much less than the best is only asked where none of the others holds. Where the
+    run without a cause leaves every bound, what others do is part of the proof.
+    """
+    gains = [before.cost - found.cost for _, found in fits]
+    if not (np.isfinite(gains).any() and np.isfinite(held_out.contributions(before)).all()):
+        return [list(fits)]
+    least = _ASKED_FIRST * max(gains)
+    first = [one for one, gain in zip(fits, gains, strict=True) if gain >= least]
+    rest = [one for one, gain in zip(fits, gains, strict=True) if not gain >= least]
+    return [first, rest]
+
+
+def proven(held_out: HeldOut, before: Fit, fits: Sequence[Fit]) -> list[Proof]:
+    """Return what each of several fits gains on held-out logs, on all processors."""
+    # once for all of them
+    held_out.contributions(before)
+    return map_forked(lambda k: held_out.prove(before, fits[k]), range(len(fits)))
 
 
 def _beside_others(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -666,10 +693,11 @@ def instead(
         k = [a.key for a in other.fit.point.hypotheses].index(other.hypothesis.key)
         value = other.fit.point.values[k]
         asked.append((without, Score(other.hypothesis, value, other.gain)))
-    held_out.contributions(without)
-    fits = refits(problem, asked, lambda found: held_out.prove(without, found))
+    fits = refits(problem, asked)
+    proofs = proven(held_out, without, [found for _, found in fits])
     out = [
-        assess_candidate(proof, without, found, hypothesis, 1) for hypothesis, found, proof in fits
+        assess_candidate(proof, without, found, hypothesis, 1)
+        for (hypothesis, found), proof in zip(fits, proofs, strict=True)
     ]
     proof = held_out.prove(without, fit)
     return without, assess_candidate(proof, without, fit, best.hypothesis, 1), out

@@ -56,11 +56,11 @@ class VaryingSimulator:
         self._step, self._samples = step, samples
         self._kernels: dict[tuple[Active, bool], FreeRunKernel] = {}
         # shared by runs of all lengths, and found sooner than by the hash of a structure
-        self._slopes: dict[Active, Slopes] = {}
+        self._slopes: Slopes | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """Drop what belongs to one process when pickled."""
-        return self.__dict__ | {"_kernels": {}, "_slopes": {}}
+        return self.__dict__ | {"_kernels": {}, "_slopes": None}
 
     def _kernel(self, active: Active, changing: bool) -> FreeRunKernel:
         key = (active, changing)
@@ -122,14 +122,9 @@ class VaryingSimulator:
         places : ndarray of int
             (m,) coefficients, and past them the current north and east.
         """
-        active = tuple(_used(theta).tolist())
-        slopes = self._slopes.pop(active, None)
-        if slopes is None:
-            slopes = slopes_of(self._step, active)
-        self._slopes[active] = slopes
-        if len(self._slopes) > _KEPT:
-            del self._slopes[next(iter(self._slopes))]
-        return slopes(x, drivers, theta, places)
+        if self._slopes is None:
+            self._slopes = slopes_of(self._step)
+        return self._slopes(x, drivers, theta, places)
 
 
 def _used(theta: Array) -> NDArray[np.int_]:

@@ -12,7 +12,7 @@ from greybox.diagnosis.evidence.held_out import long_run_variance, proof_of
 from greybox.diagnosis.extension import extended_vessel
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
-from greybox.diagnosis.linear import NOWHERE, sensitivities
+from greybox.diagnosis.linear import NOWHERE, Slopes, sensitivities
 from greybox.diagnosis.noise import Likelihood, Noise, NoiseModel, fit_noise
 from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.null_model import _as_it_should_be
@@ -32,6 +32,7 @@ from greybox.diagnosis.waves import find_waves, noise_in, squares_in
 from greybox.model.catalogue import get_structure
 from greybox.model.run.simulation import simulate
 from greybox.model.run.step import StepModel
+from greybox.numerics import machine_code
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.study.blind import draw
 from greybox.study.chapter6 import TRUE
@@ -105,6 +106,28 @@ def test_slopes_of_a_step_longer_than_the_ship_are_differences(log: TrialLog) ->
         difference = (ends[1] - ends[0]) / 2e-6
         size = max(float(np.abs(difference).max()), 1e-6)
         np.testing.assert_allclose(slopes[:, :, place], difference, atol=1e-4 * size)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+@pytest.mark.parametrize("damping", [-0.2, -2.0])
+@pytest.mark.parametrize("changing", [False, True])
+def test_slopes_on_arrays_are_those_of_machine_code(
+    log: TrialLog, integrator, damping: float, changing: bool, monkeypatch
+) -> None:
+    step = LogRun(WIDE, log, integrator)._simulator._step
+    theta = _theta(WIDE)
+    theta[WIDE.index("Xu")] = damping
+    if changing:
+        theta = theta * np.linspace(0.9, 1.1, len(log))[:, None]
+    ship = Ship(_theta(WIDE), np.array([0.2, -0.1]), log.vessel)
+    run = LogRun(WIDE, log, integrator)
+    given = (run.run(ship, run.start()).x, run._drivers(ship), theta, np.arange(theta.shape[-1]))
+    found = Slopes(step)(*given)
+    monkeypatch.setattr(machine_code, "find_compiler", lambda: None)
+    monkeypatch.setattr(machine_code, "cache_folder", lambda: None)
+    expected = Slopes(step)(*given)
+    for one, two in ((found.a, expected.a), (found.driven, expected.driven)):
+        np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-13 * np.abs(two).max())
 
 
 @pytest.mark.parametrize("late", [2.5, -1.25, 0.5])

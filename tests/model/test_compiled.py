@@ -141,7 +141,7 @@ def test_what_was_compiled_before_is_opened(cache, monkeypatch):
 def test_steps_are_interpreted_until_compiling_pays(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(machine_code, "find_compiler", lambda: None)
-    loop = compiled.Loop(STEP.function, 1)
+    loop = compiled.loop_of.__wrapped__(STEP.function, 1)
     assert not loop.pays(1)
     assert not (tmp_path / "greybox").exists()
     assert not loop.pays(10**7)

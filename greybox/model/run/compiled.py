@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 # and a quarter of a second, as long as the compiler takes
 _LOOK, _PAYS = 10**6, 3 * 10**7
 # `step` and `along` are names of the C library or may be: these are nobody's
-_STEP, _LOOP = "greybox_step", "greybox_loop"
+STEP, LOOP = "greybox_step", "greybox_loop"
 
 
 def _loop_text(step: ca.Function, carried: int) -> str:
@@ -36,7 +36,7 @@ def _loop_text(step: ca.Function, carried: int) -> str:
     gives = [step.numel_out(i) for i in range(step.n_out())]
     kept = [f"now{i}[j] = " if i < carried else "" for i in range(len(gives))]
     lines = [
-        f"void {_LOOP}(long long samples, const double* const* given, double* const* out) {{",
+        f"void {LOOP}(long long samples, const double* const* given, double* const* out) {{",
         "  long long k;",
         "  int j;",
         *(f"  double now{i}[{n}];" for i, n in enumerate(takes)),
@@ -51,7 +51,7 @@ def _loop_text(step: ca.Function, carried: int) -> str:
         ),
         "  for (k = 0; k < samples; k++) {",
         f"    for (j = 0; j < {takes[carried]}; j++) now{carried}[j] = *read++;",
-        f"    {_STEP}(arg, res, 0, 0, 0);",
+        f"    {STEP}(arg, res, 0, 0, 0);",
         *(
             f"    for (j = 0; j < {n}; j++) *out{i}++ = {kept[i]}next{i}[j];"
             for i, n in enumerate(gives)
@@ -66,7 +66,7 @@ def _source(step: ca.Function, loop: str) -> str:
     """Return C code of a step, and of its loop."""
     generator = ca.CodeGenerator("step", {"casadi_int": "int", "casadi_real": "double"})
     given = [ca.SX.sym(step.name_in(i), step.sparsity_in(i)) for i in range(step.n_in())]
-    generator.add(ca.Function(_STEP, given, step.call(given)))
+    generator.add(ca.Function(STEP, given, step.call(given)))
     # the step is part of the loop, so that it need not go to memory for what it carries
     return f"#define CASADI_SYMBOL_EXPORT static\n{generator.dump()}{SHOWN}{loop}"
 
@@ -77,14 +77,14 @@ class Loop:
     Parameters
     ----------
     step : casadi.Function
-        SX. Arguments are what it hands to the next one, then a column that changes with the
-        step, then constants; results begin with what is handed on.
-    carried : int
-        How many arguments are handed on.
+        SX.
+    text : str
+        C code of the loop, a function `LOOP` of the number of samples, the arrays given and those
+        to fill, to stand behind the function `STEP` that CasADi makes of the step.
     """
 
-    def __init__(self, step: ca.Function, carried: int) -> None:
-        self._step, self._carried = step, carried
+    def __init__(self, step: ca.Function, text: str) -> None:
+        self._step, self._text = step, text
         self._taken = 0
         self._opened = self._compiled = False
         self._run: Callable[..., None] | None = None
@@ -99,15 +99,24 @@ class Loop:
                 self._compiled, self._run = True, self._library.made()
         return self._run is not None
 
+    def made(self) -> bool:
+        """Return whether steps are to be taken here, from the first one on.
+
+        Of what is done in another way elsewhere the same command gives the same digits each time.
+        """
+        if not self._compiled:
+            self._opened = self._compiled = True
+            self._run = self._run or self._library.found() or self._library.made()
+        return self._run is not None
+
     @cached_property
     def _library(self) -> Library:
-        loop = _loop_text(self._step, self._carried)
-        key = (self._step.serialize(), loop, ca.CasadiMeta.version())
+        key = (self._step.serialize(), self._text, ca.CasadiMeta.version())
         arguments = [ctypes.c_longlong, ctypes.c_void_p, ctypes.c_void_p]
-        return Library(lambda: _source(self._step, loop), _LOOP, arguments, repr(key))
+        return Library(lambda: _source(self._step, self._text), LOOP, arguments, repr(key))
 
     def __call__(self, samples: int, given: Sequence[Array], out: Sequence[Array]) -> None:
-        """Take steps; only after `pays` said so.
+        """Take steps; only after `pays` or `made` said so.
 
         Parameters
         ----------
@@ -127,5 +136,14 @@ class Loop:
 
 @lru_cache(maxsize=128)
 def loop_of(step: ca.Function, carried: int) -> Loop:
-    """Return the loop of a step, the same one each time."""
-    return Loop(step, carried)
+    """Return the loop of a step, the same one each time.
+
+    Parameters
+    ----------
+    step : casadi.Function
+        SX. Arguments are what it hands to the next one, then a column that changes with the
+        step, then constants; results begin with what is handed on.
+    carried : int
+        How many arguments are handed on.
+    """
+    return Loop(step, _loop_text(step, carried))

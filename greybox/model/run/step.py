@@ -32,8 +32,8 @@ Rule = Literal["euler", "trapezoid"]
 
 # the classical Runge-Kutta rule: the share of a stage's slope at which the next one looks,
 # and what each counts
-_AHEAD = (0.5, 0.5, 1.0)
-_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+AHEAD = (0.5, 0.5, 1.0)
+WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 
 _State = TypeVar("_State", ca.SX, Array)
 
@@ -160,8 +160,8 @@ class StepModel:
             return now
         if self.integrator == "euler":
             return start + now
-        total = _WEIGHTS[0] * now
-        for share, weight in zip(_AHEAD, _WEIGHTS[1:], strict=True):
+        total = WEIGHTS[0] * now
+        for share, weight in zip(AHEAD, WEIGHTS[1:], strict=True):
             now = slope(start + share * now)
             total = total + weight * now
         return start + total
