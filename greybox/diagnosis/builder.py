@@ -147,7 +147,7 @@ class DiagnosisBuilder:
             less = 100 * (1 - weighed.direction)
             evidence += f", and {less:.1f} % of winds turned at random would explain less"
         if weighed is not None and weighed.stands and weighed.told >= PROVEN:
-            evidence += "; that it is there is proven, its size is not"
+            evidence += ", its size not proven"
         return Found(
             candidate.hypothesis.id, candidate.hypothesis.key, cause.title, quantities,
             candidate.p_value, candidate.p_adjusted, evidence, cause.extension,

@@ -377,11 +377,14 @@ def _likely_first(
 ) -> list[list[tuple[Hypothesis, Fit]]]:
     """Return fits with one more cause in the parts in which held-out logs are asked of them.
 
-    One that gains much less than the best is only asked where none of the others holds. Where the
-    run without a cause leaves every bound, what others do is part of the proof.
+    One that gains much less than the best is only asked where none of the others holds. Of errors
+    that are weighed by their size alone the held-out logs may tell something else than those that
+    were fitted to, so that all are asked; and where the run without a cause leaves every bound,
+    what others do is part of the proof.
     """
     gains = [before.cost - found.cost for _, found in fits]
-    if not (np.isfinite(gains).any() and np.isfinite(held_out.contributions(before)).all()):
+    bounded = np.isfinite(gains).any() and np.isfinite(held_out.contributions(before)).all()
+    if not (before.noise.coloured and bounded):
         return [list(fits)]
     least = _ASKED_FIRST * max(gains)
     first = [one for one, gain in zip(fits, gains, strict=True) if gain >= least]
