@@ -351,6 +351,7 @@ def take_step(
         fits += case.restart(fit, left, [s.hypothesis for s in scores if s.gain == -np.inf])
     fits = likelier(fits)
     candidates: list[Candidate] = []
+    taken: Candidate | None = None
     for some in _likely_first(fits, held_out, fit):
         proofs = proven(held_out, fit, [found for _, found in some])
         candidates += [
@@ -358,10 +359,10 @@ def take_step(
             for (hypothesis, found), proof in zip(some, proofs, strict=True)
         ]
         candidates = _beside_others(sorted(candidates, key=_bic))
-        if any(c.holds for c in candidates):
+        sure = (_wald_checked(case, c) for c in candidates if c.holds)
+        taken = next((c for c in sure if c.holds), None)
+        if taken is not None:
             break
-    sure = (_wald_checked(case, c) for c in candidates if c.holds)
-    taken = next((c for c in sure if c.holds), None)
     if taken is not None and not enough(taken.fit):
         taken = None
     if taken is not None:

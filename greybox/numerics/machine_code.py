@@ -20,7 +20,7 @@ from greybox.numerics.compiler import FLAGS, find_compiler, shared_library
 
 # to stand before what a library shows
 SHOWN = '__attribute__((visibility("default")))\n'
-# libraries that are kept, some 16 kB each
+# libraries that are kept, 16 to 40 kB each
 _MOST = 500
 _log = logging.getLogger(__name__)
 
