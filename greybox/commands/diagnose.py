@@ -194,7 +194,7 @@ def _with_files(steps: Sequence[str], record: Mapping[str, Any]) -> list[str]:
     ]
     if not out and any("MODEL" in step for step in steps):
         filled.insert(
-            0, f"write the models to files: the same command with --out {quote(str(model))}"
+            0, f"write the models to files: the same command with: --out {quote(str(model))}"
         )
     return filled
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -102,9 +103,9 @@ def _headline(diagnosis: Diagnosis) -> str:
 
 
 def _step(told: str) -> NextStep:
-    """Return a step with its command apart from the words before it."""
-    purpose, _, command = told.rstrip(".").partition(": greybox ")
-    return NextStep(capital(purpose), f"greybox {command}" if command else "")
+    """Return a step with its command, or options of one, apart from the words before it."""
+    purpose, *command = re.split(r": (?=greybox |--)", told.rstrip("."), maxsplit=1)
+    return NextStep(capital(purpose), *command)
 
 
 def _summary(diagnosis: Diagnosis) -> list[str]:

@@ -334,7 +334,7 @@ def test_next_steps_name_the_files_of_the_user():
     known = {"vessel": "my ship.toml"}
     record = {"command": known, "line": "greybox diagnose log.csv --vessel 'my ship.toml'"}
     first, between, plan = _with_files(steps, record)
-    assert first == "write the models to files: the same command with --out mended.json"
+    assert first == "write the models to files: the same command with: --out mended.json"
     assert "--vessel 'my ship.toml' --between mended.a.json mended.b.json " in between
     assert "--vessel 'my ship.toml' --model mended.json " in plan
     filled = _with_files(steps, record | {"command": known | {"out": "runs/better.json"}})
