@@ -382,8 +382,19 @@ def _warnings(design: Design, band: MotionBand) -> tuple[str, ...]:
 
 def corridor(design: Design, band: MotionBand) -> tuple[Array, Array]:
     """Return how far heading [rad] and position [m] may be off the plan, each (N+1,)."""
-    floor = max(POSITION_FLOOR, design.request.vessel.length)
+    floor = _position_floor(design)
     return np.maximum(band.heading_off, HEADING_FLOOR), np.maximum(band.position_off, floor)
+
+
+def _position_floor(design: Design) -> float:
+    return max(POSITION_FLOOR, design.request.vessel.length)
+
+
+def _extent(design: Design, band: MotionBand) -> float:
+    """Return how far from its start the plan goes [m]: a larger corridor limits nothing."""
+    north, east = band["x_n"].nominal, band["y_n"].nominal
+    farthest = float(np.hypot(north - north[0], east - east[0]).max())
+    return max(farthest, _position_floor(design))
 
 
 def _over(largest: float, edge: float) -> tuple[float, str]:
@@ -451,9 +462,10 @@ def _abort(design: Design, band: MotionBand) -> tuple[str, ...]:
         if blind.any():
             text += (
                 f". After that the model cannot tell the heading within "
-                f"{np.rad2deg(_BLIND):.0f}°: keep the other limits, position within "
-                f"{place[-1]:.0f} m"
+                f"{np.rad2deg(_BLIND):.0f}°: keep the other limits"
             )
+            if place[-1] <= _extent(design, band):
+                text += f", position within {place[-1]:.0f} m"
         said.append(text + ".")
     for name, sign in r.regimes[band.trial]:
         margin = limits.margins.get(name, 0.0)
@@ -531,10 +543,10 @@ def _table_of(
     if not band.certain:
         off = corridor(design, band)
         turned = np.rad2deg(off[0][samples])
-        blind = np.rad2deg(_BLIND)
+        blind, extent = np.rad2deg(_BLIND), _extent(design, band)
         columns += [
             Column("±", "°", tuple(f"{v:.0f}" if v <= blind else "–" for v in turned)),
-            Column("±", "m", tuple(f"{v:.0f}" for v in off[1][samples])),
+            Column("±", "m", tuple(f"{v:.0f}" if v <= extent else "–" for v in off[1][samples])),
         ]
     return tuple(columns)
 

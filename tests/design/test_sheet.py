@@ -173,6 +173,23 @@ def test_abort_limits_in_words(unsure, known):
     assert "no cap was set" in said
 
 
+def test_a_corridor_wider_than_the_plan_is_not_told(unsure):
+    (band,) = predict_motion(unsure)
+    half = len(band.t) // 2
+    blind = np.where(np.arange(len(band.t)) < half, 0.3, 3.0)
+    for off, told in ((40.0, True), (9000.0, False)):
+        away = np.where(blind < 1.0, 20.0, off)
+        lost = replace(band, heading_off=blind, position_off=away)
+        contents = sheet_contents(unsure, lost)
+        said = "\n".join(contents.abort)
+        assert "After that the model cannot tell the heading within 90°" in said
+        assert ("position within 40 m" in said) is told
+        assert "9000 m" not in said
+        (cells,) = (c.cells for c in contents.columns if (c.name, c.unit) == ("±", "m"))
+        assert cells[0] == "30"
+        assert cells[-1] == ("40" if told else "–")
+
+
 @pytest.mark.parametrize(("wide", "over"), [(1.0, 10), (1.2, 32), (4.0, 50)])
 def test_without_a_cap_the_plan_itself_sets_the_limits(known, wide, over):
     (band,) = predict_motion(known)
