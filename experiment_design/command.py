@@ -570,9 +570,12 @@ def _run_for_prediction(
     options: argparse.Namespace, model: Any, vessel: Any, sailed: Any, told: tuple[str, ...]
 ) -> None:
     """Design the trial that serves predictions and write it."""
-    from experiment_design.for_prediction import design_for_prediction
+    from experiment_design.for_prediction import design_for_prediction, planning_model
     from experiment_design.prepare import both_sides
 
+    if sailed is None:
+        model, said = planning_model(model, vessel)
+        told = (*told, said) if said else told
     asked = both_sides(_asked(options, model, sailed), model)
     request, ended = _prepared(options, model, asked, vessel, sailed)
     notes = (*told, *request.of_both_sides)

@@ -39,11 +39,15 @@ from experiment_design.request.regimes import STEADY_SECONDS, start_words
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.channels import CHANNELS
 from greybox.diagnosis.result import finite
-from greybox.errors import InfeasibleError
+from greybox.errors import InfeasibleError, VesselError
+from greybox.estimation.prediction_verdict import HeldCommandsDiverge
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
+from greybox.model.semi_empirical import METHOD as SEMI_EMPIRICAL
+from greybox.model.semi_empirical import NO_TRIAL, semi_empirical_model
 from greybox.numerics.threads import one_thread
 from greybox.trial.plan_parts import LEAD_IN, TRIAL, VALIDATION
+from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
 
@@ -256,6 +260,52 @@ def prior_misfit(model: ManoeuvringModel) -> tuple[Array, str]:
         for s in model.structure.states
     ]  # fmt: skip
     return np.array(shares), str(prediction.get("level", ""))
+
+
+def planning_model(model: ManoeuvringModel, vessel: Vessel) -> tuple[ManoeuvringModel, str]:
+    """Return the model that a trial for predictions is planned with, and what is said of it.
+
+    It is the prior, unless its free run diverges with commands of its own logs held: a plan goes
+    where its model can be followed, so one made with such a prior stays away from these commands,
+    of which least is known, or keeps a straight course. The main dimensions then take its place,
+    with the ranges of commands and the verdict that the prior has.
+
+    Parameters
+    ----------
+    model : ManoeuvringModel
+        The prior, with what its own trial showed.
+    vessel : Vessel
+        Whose dimensions are taken; without them the prior stays.
+
+    Raises
+    ------
+    UsageError
+        The prior is of a ship with other commands.
+    """
+    require_own_commands(model, vessel)
+    verdict = model.record.get("verdict")
+    prediction = verdict.get("prediction") if isinstance(verdict, Mapping) else None
+    because = prediction.get("because") if isinstance(prediction, Mapping) else None
+    reasons = [r for r in because or () if isinstance(r, Mapping)]
+    fatal = [r for r in reasons if r.get("kind") == HeldCommandsDiverge.kind]
+    if not fatal or model.record.get("method") == SEMI_EMPIRICAL:
+        return model, ""
+    shown = model.record.get("ranges")
+    shown = shown if isinstance(shown, Mapping) else {}
+    if vessel.service_speed is None and "u" in shown and float(shown["u"][1]) > 0:
+        vessel = replace(vessel, service_speed=float(shown["u"][1]))
+    try:
+        found = semi_empirical_model(vessel)
+    except VesselError:
+        return model, ""
+    ranges = {n: shown[n] for n in vessel.commands if n in shown}
+    notes = [n.removeprefix(NO_TRIAL) for n in found.record["notes"]]
+    record = {**found.record, "ranges": ranges, "verdict": verdict, "notes": notes}
+    said = (
+        f"the prior is not planned with: {fatal[0].get('sentence', 'its free run diverges')}; "
+        f"the ship's main dimensions take its place"
+    )
+    return replace(found, record=record), said
 
 
 def diagnosed_misfit(model: ManoeuvringModel) -> dict[str, float]:

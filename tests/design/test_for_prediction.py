@@ -20,6 +20,7 @@ from experiment_design.for_prediction import (
     design_for_prediction,
     diagnosed_misfit,
     operating_envelope,
+    planning_model,
     prior_misfit,
     started_in,
 )
@@ -321,6 +322,34 @@ def test_the_misfit_of_a_prior_is_what_its_verdict_says(model) -> None:
     assert level == ""
 
 
+def runaway(model):
+    """Return a prior whose free run diverged with commands of its own logs held."""
+    sentence = "its free run diverges with 4 of 16 settings of the commands"
+    because = [{"kind": "held_commands_diverge", "fatal": True, "sentence": sentence}]
+    prediction = {"level": "poor", "fit": {"u": 88.0}, "because": because}
+    ranges = {"u": [0.5, 2.5], "r": [-0.1, 0.1], "n": [12.0, 18.0]}
+    return replace(model, record={"verdict": {"prediction": prediction}, "ranges": ranges})
+
+
+def test_a_prior_that_runs_away_gives_way_to_main_dimensions(model) -> None:
+    ship = limited_ship()
+    prior = replace(runaway(model), vessel=ship)
+    found, said = planning_model(prior, ship)
+    assert found.record["method"] == "semi-empirical"
+    assert "its free run diverges with 4 of 16 settings" in said
+    assert said.endswith("the ship's main dimensions take its place")
+    assert "service speed 2.5 m/s" in found.record["notes"][0]
+    assert not any("no trial is known" in note for note in found.record["notes"])
+    # as the prior was used, and as little as it was trusted
+    assert command_ranges(found, {})["n"] == command_ranges(prior, {})["n"]
+    assert prior_misfit(found)[1] == "poor"
+    # planned with as it is where it holds the commands, or too little of the ship is known
+    steady = replace(prior, record={})
+    assert planning_model(steady, ship) == (steady, "")
+    bare = replace(ship, thrusters=tuple(replace(t, speed_limits=Limits()) for t in ship.thrusters))
+    assert planning_model(replace(prior, vessel=bare), bare)[1] == ""
+
+
 def gained(**after):
     return {"gain": {s: {"before": 0.0, "after": fit, "ci": [0, 1]} for s, fit in after.items()}}
 
@@ -431,6 +460,18 @@ def test_the_command(files, capsys: pytest.CaptureFixture[str]) -> None:
     (note,) = [n for n in told["notes"] if "steady motion" in n]
     name, level = next(iter(held.items()))
     assert f"rad/s, psi 0 rad, held by {name} {level:.4g}" in note
+
+
+@pytest.mark.usefixtures("hasty")
+def test_the_command_with_a_prior_that_runs_away(files, capsys) -> None:
+    prior = files / "runaway.json"
+    runaway(thesis_model(spread=0.02)).save(prior)
+    asked = ["design", "--vessel", str(files / "ship.toml"), "--model", str(prior), "--duration",
+             "120", "--out", str(files / "away.csv"), "--effort", "0.2"]  # fmt: skip
+    assert main(asked) == 0
+    said = capsys.readouterr().out
+    assert "planned without an estimated model, from main dimensions" in said
+    assert "Note: the prior is not planned with: its free run diverges with 4 of 16" in said
 
 
 @pytest.mark.parametrize(
