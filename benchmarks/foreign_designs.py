@@ -4,6 +4,7 @@ Ships of `tests/foreign_ships` sail a first trial of random steps, `greybox esti
 prior, and a second trial of each kind is sailed and estimated with defaults, as a user does:
 
     PYTHONPATH=tests python -m benchmarks.foreign_designs --out DIR [--ships ...] [--seeds ...]
+        [--arms ...]
 
 Trials last sixty lengths, 5 to 15 min. `random` holds settings for half a length to two lengths,
 `zigzag` goes to both sides at three speeds, `plan` is `greybox design`; `long-` is half as long
@@ -41,7 +42,6 @@ SHIPS = (
     "survey-catamaran-2m",
 )  # fmt: skip
 ARMS = ("random", "zigzag", "plan", "long-random", "long-zigzag")
-OTHERS = tuple(arm for arm in ARMS if arm != "plan")
 # lengths sailed in a trial, its least and its greatest duration [s]
 TRIAL, SHORTEST, LONGEST = 60, 300.0, 900.0
 STEPS = random_steps(hold=(0.5, 2.0))
@@ -121,13 +121,13 @@ def fit(folder: Path, name: str, arm: str, seed: int) -> list[float]:
     return [float(f) for f in json.loads(told.read_text())]
 
 
-def case(place: Path, name: str, seed: int) -> dict[str, list[float]]:
+def case(place: Path, name: str, seed: int, arms: Sequence[str]) -> dict[str, list[float]]:
     """Return the fits of each kind of trial of one ship."""
     folder = place / f"{name}-{seed}"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "vessel.toml").write_text(presets()[name].ship.vessel_toml())
     found: dict[str, list[float]] = {}
-    for arm in ("first", *ARMS):
+    for arm in ("first", *arms):
         try:
             found[arm] = fit(folder, name, arm, seed)
         except subprocess.CalledProcessError as error:
@@ -150,11 +150,12 @@ def paired(logs: Array) -> str:
 
 def row(name: str, cases: Sequence[dict[str, list[float]]]) -> str:
     """Return mean fits, and the errors of each other kind of trial over those of the plan."""
-    fits = {arm: np.array([c[arm] for c in cases]) for arm in ("first", *ARMS)}
+    fits = {arm: np.array([c[arm] for c in cases]) for arm in cases[0]}
     means = "".join(f"{np.nanmean(f):>12.1f}" for f in fits.values())
     # geometric mean over the states of the rms error in the deviation of each
     errors = {arm: np.log(np.maximum(1 - f / 100, 1e-6)).mean(axis=1) for arm, f in fits.items()}
-    told = "".join(f"   {paired(errors[arm] - errors['plan']):<24}" for arm in OTHERS)
+    others = [arm for arm in errors if arm not in ("first", "plan")] if "plan" in errors else []
+    told = "".join(f"   {paired(errors[arm] - errors['plan']):<24}" for arm in others)
     return f"{name:<24}{means}{told}".rstrip()
 
 
@@ -163,15 +164,18 @@ def main() -> None:
     parser.add_argument("--out", required=True, type=Path)
     parser.add_argument("--ships", nargs="+", default=list(SHIPS), choices=sorted(presets()))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4])
+    parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=ARMS)
     options = parser.parse_args()
     found: dict[str, list[dict[str, list[float]]]] = {name: [] for name in options.ships}
     for seed in options.seeds:
         for name in options.ships:
-            found[name].append(case(options.out, name, seed))
+            found[name].append(case(options.out, name, seed, options.arms))
             told = {arm: round(float(np.mean(v)), 1) for arm, v in found[name][-1].items()}
             print(f"{name} {seed}: {told}", flush=True)
-    print(f"{'mean held-out fit [%]':<24}" + "".join(f"{arm:>12}" for arm in ("first", *ARMS))
-          + "".join(f"   {f'{arm} over plan':<24}" for arm in OTHERS) + "   (errors)")  # fmt: skip
+    others = [arm for arm in options.arms if arm != "plan"] if "plan" in options.arms else []
+    print(f"{'mean held-out fit [%]':<24}"
+          + "".join(f"{arm:>12}" for arm in ("first", *options.arms))
+          + "".join(f"   {f'{arm} over plan':<24}" for arm in others) + "   (errors)")  # fmt: skip
     for name, cases in found.items():
         print(row(name, cases))
     print(row("all", [c for cases in found.values() for c in cases]))
