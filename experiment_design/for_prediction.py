@@ -437,8 +437,7 @@ def design_for_prediction(
     known = before + log_moments(found, design.motions[1:])
     noise, unknown = found.errors(design.motions[0], known)
     if vague := [s for i, s in enumerate(states) if noise[0, i] + unknown[0, i] >= 1]:
-        said = f"after this trial the mean would predict {', '.join(vague)} no worse: lengthen it"
-        design = replace(design, notes=(said, *design.notes))
+        design = replace(design, notes=(_vague_note(vague, searches[0].kept), *design.notes))
     missed = diagnosed_misfit(model) if level == _DIAGNOSED else {}
     # no cause that a diagnosis knows, and no coefficient, explained it
     unknown = np.maximum(unknown, [missed.get(s, 0.0) ** 2 for s in states])
@@ -461,6 +460,17 @@ def design_for_prediction(
         level,
         missed,
     )  # fmt: skip
+
+
+def _vague_note(states: Sequence[str], kept: int) -> str:
+    """Return what helps where a plan leaves some states as unknown as before."""
+    said = f"after this trial the mean would predict {', '.join(states)} no worse"
+    if kept:
+        return f"{said}: lengthen it"
+    return (
+        f"{said}, for the prior keeps none of {RANDOM} random sequences within the limits: widen "
+        f"them, estimate it on a longer trial, or use --prior none"
+    )
 
 
 def started_in(request: PreparedRequest, envelope: Envelope, kept: int) -> PreparedRequest:

@@ -16,6 +16,7 @@ from experiment_design.excitation.rollout import Rollout
 from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
 from experiment_design.for_causes import AskedCauses, open_causes
 from experiment_design.for_prediction import (
+    _vague_note,
     command_ranges,
     design_for_prediction,
     diagnosed_misfit,
@@ -348,6 +349,13 @@ def test_a_prior_that_runs_away_gives_way_to_main_dimensions(model) -> None:
     assert planning_model(steady, ship) == (steady, "")
     bare = replace(ship, thrusters=tuple(replace(t, speed_limits=Limits()) for t in ship.thrusters))
     assert planning_model(replace(prior, vessel=bare), bare)[1] == ""
+
+
+def test_a_plan_that_tells_nothing_says_what_helps() -> None:
+    assert _vague_note(["u", "r"], 12).endswith("predict u, r no worse: lengthen it")
+    said = _vague_note(["u"], 0)
+    assert "the prior keeps none of 200 random sequences within the limits" in said
+    assert said.endswith("or use --prior none")
 
 
 def gained(**after):
