@@ -268,7 +268,7 @@ def planning_model(model: ManoeuvringModel, vessel: Vessel) -> tuple[Manoeuvring
     It is the prior, unless its free run diverges with commands of its own logs held: a plan goes
     where its model can be followed, so one made with such a prior stays away from these commands,
     of which least is known, or keeps a straight course. The main dimensions then take its place,
-    with the ranges of commands and the verdict that the prior has.
+    with the ranges of commands and the level of prediction that the prior has.
 
     Parameters
     ----------
@@ -285,8 +285,9 @@ def planning_model(model: ManoeuvringModel, vessel: Vessel) -> tuple[Manoeuvring
     require_own_commands(model, vessel)
     verdict = model.record.get("verdict")
     prediction = verdict.get("prediction") if isinstance(verdict, Mapping) else None
-    because = prediction.get("because") if isinstance(prediction, Mapping) else None
-    reasons = [r for r in because or () if isinstance(r, Mapping)]
+    prediction = prediction if isinstance(prediction, Mapping) else {}
+    because = prediction.get("because")
+    reasons = [r for r in because if isinstance(r, Mapping)] if isinstance(because, list) else []
     fatal = [r for r in reasons if r.get("kind") == HeldCommandsDiverge.kind]
     if not fatal or model.record.get("method") == SEMI_EMPIRICAL:
         return model, ""
@@ -300,7 +301,9 @@ def planning_model(model: ManoeuvringModel, vessel: Vessel) -> tuple[Manoeuvring
         return model, ""
     ranges = {n: shown[n] for n in vessel.commands if n in shown}
     notes = [n.removeprefix(NO_TRIAL) for n in found.record["notes"]]
-    record = {**found.record, "ranges": ranges, "verdict": verdict, "notes": notes}
+    # how well the prior followed its own log says nothing of main dimensions
+    level = {"prediction": {"level": prediction.get("level", "")}}
+    record = {**found.record, "ranges": ranges, "verdict": level, "notes": notes}
     said = (
         f"the prior is not planned with: {fatal[0].get('sentence', 'its free run diverges')}; "
         f"the ship's main dimensions take its place"

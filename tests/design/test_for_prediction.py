@@ -343,7 +343,9 @@ def test_a_prior_that_runs_away_gives_way_to_main_dimensions(model) -> None:
     assert not any("no trial is known" in note for note in found.record["notes"])
     # as the prior was used, and as little as it was trusted
     assert command_ranges(found, {})["n"] == command_ranges(prior, {})["n"]
-    assert prior_misfit(found)[1] == "poor"
+    misfit, level = prior_misfit(found)
+    assert level == "poor"
+    assert (misfit == prior_misfit(replace(prior, record={}))[0]).all()
     # planned with as it is where it holds the commands, or too little of the ship is known
     steady = replace(prior, record={})
     assert planning_model(steady, ship) == (steady, "")
