@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from greybox.errors import LogError
 from greybox.model.model import ManoeuvringModel
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
+from greybox.vessel.force import generalised_force
 
 Array = NDArray[np.float64]
 
@@ -57,6 +58,18 @@ class Sailed:
             "end": self.end.tolist(),
             "place": None if self.place is None else list(self.place),
         }
+
+    def as_inputs_of(self, model: ManoeuvringModel, prior: ManoeuvringModel) -> Sailed:
+        """Return the same motions at the sample time of another model, with its inputs.
+
+        Parameters
+        ----------
+        model : ManoeuvringModel
+            With the same states, and no other commands.
+        prior : ManoeuvringModel
+            That the motions are of.
+        """
+        return replace(self, motions=tuple(_resampled(m, model, prior) for m in self.motions))
 
     def sentence(self) -> str:
         """Return how much has been sailed."""
@@ -134,6 +147,22 @@ def log_motion(model: ManoeuvringModel, log: TrialLog) -> Motion:
     commands = np.column_stack([log[c] for c in log.vessel.commands])
     tau = log.forces(model.structure.inputs)
     return Motion(state, tau[known][None], commands[known][None], np.ones(1, bool))
+
+
+def _resampled(motion: Motion, model: ManoeuvringModel, prior: ManoeuvringModel) -> Motion:
+    from scipy.interpolate import make_interp_spline
+
+    samples, step, vessel = motion.tau.shape[1], prior.sample_time, model.vessel
+    count = int(samples * step / model.sample_time + 1e-9)
+    t = model.sample_time * np.arange(count + 1)
+    known = step * np.arange(samples + 1)
+    state = make_interp_spline(known, motion.state[0], k=1)(t) if count else motion.state[0, :1]
+    held = np.minimum((t[:-1] / step + 1e-9).astype(int), samples - 1)
+    columns = [prior.vessel.commands.index(n) for n in vessel.commands]
+    commands = motion.commands[0][held][:, columns]
+    made = generalised_force(vessel, dict(zip(vessel.commands, commands.T, strict=True)))
+    tau = np.stack([made.get(n, np.zeros(count)) for n in model.structure.inputs], axis=-1)
+    return Motion(state[None], tau[None], commands[None], motion.stable)
 
 
 def log_moments(envelope: Envelope, motions: Sequence[Motion]) -> Array | float:

@@ -573,9 +573,11 @@ def _run_for_prediction(
     from experiment_design.for_prediction import design_for_prediction, planning_model
     from experiment_design.prepare import both_sides
 
-    if sailed is None:
-        model, said = planning_model(model, vessel)
-        told = (*told, said) if said else told
+    prior = model
+    model, said = planning_model(prior, vessel)
+    if said:
+        told = (*told, said)
+        sailed = None if sailed is None else sailed.as_inputs_of(model, prior)
     asked = both_sides(_asked(options, model, sailed), model)
     request, ended = _prepared(options, model, asked, vessel, sailed)
     notes = (*told, *request.of_both_sides)

@@ -299,6 +299,8 @@ def planning_model(model: ManoeuvringModel, vessel: Vessel) -> tuple[Manoeuvring
         found = semi_empirical_model(vessel)
     except VesselError:
         return model, ""
+    if found.structure.states != model.structure.states:
+        return model, ""
     ranges = {n: shown[n] for n in vessel.commands if n in shown}
     notes = [n.removeprefix(NO_TRIAL) for n in found.record["notes"]]
     # how well the prior followed its own log says nothing of main dimensions

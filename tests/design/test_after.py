@@ -114,6 +114,22 @@ def test_a_run_that_escapes_leaves_the_measured_states(model) -> None:
     np.testing.assert_array_equal(found.state[0, :-1, 0], log["u"])
 
 
+def test_what_was_sailed_moves_on_with_another_model(model) -> None:
+    log = sailed_log(3, 121, model)
+    sailed = sailed_trial(model, [log], 1)
+    half = replace(model, sample_time=0.5 * model.sample_time)
+    (motion,) = sailed.as_inputs_of(half, model).motions
+    (whole,) = sailed.motions
+    np.testing.assert_allclose(motion.state[0, ::2], whole.state[0], atol=1e-12)
+    middle = (whole.state[0, :-1] + whole.state[0, 1:]) / 2
+    np.testing.assert_allclose(motion.state[0, 1::2], middle, atol=1e-12)
+    for late in (0, 1):
+        np.testing.assert_array_equal(motion.commands[0, late::2], whole.commands[0])
+        np.testing.assert_allclose(motion.tau[0, late::2], whole.tau[0], atol=1e-12)
+    same = sailed.as_inputs_of(model, model).motions[0]
+    np.testing.assert_allclose(same.state, whole.state, atol=1e-12)
+
+
 def test_where_the_log_ended(model) -> None:
     log = sailed_log(3, 100, model)
     t = log.t
