@@ -44,7 +44,7 @@ from greybox.estimation.prediction_verdict import HeldCommandsDiverge
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
 from greybox.model.semi_empirical import METHOD as SEMI_EMPIRICAL
-from greybox.model.semi_empirical import NO_TRIAL, semi_empirical_model
+from greybox.model.semi_empirical import semi_empirical_model
 from greybox.numerics.threads import one_thread
 from greybox.trial.plan_parts import LEAD_IN, TRIAL, VALIDATION
 from greybox.vessel.vessel import Vessel
@@ -302,10 +302,9 @@ def planning_model(model: ManoeuvringModel, vessel: Vessel) -> tuple[Manoeuvring
     if found.structure.states != model.structure.states:
         return model, ""
     ranges = {n: shown[n] for n in vessel.commands if n in shown}
-    notes = [n.removeprefix(NO_TRIAL) for n in found.record["notes"]]
     # how well the prior followed its own log says nothing of main dimensions
     level = {"prediction": {"level": prediction.get("level", "")}}
-    record = {**found.record, "ranges": ranges, "verdict": level, "notes": notes}
+    record = {**found.record, "ranges": ranges, "verdict": level}
     said = (
         f"the prior is not planned with: {fatal[0].get('sentence', 'its free run diverges')}; "
         f"the ship's main dimensions take its place"

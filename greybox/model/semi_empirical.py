@@ -32,8 +32,6 @@ from greybox.vessel.vessel import Thruster, Vessel
 Array = NDArray[np.float64]
 
 METHOD = "semi-empirical"
-# how its first note begins
-NO_TRIAL = "no trial is known: "
 # sea water, and air [kg/m³]; kinematic viscosity [m²/s]; [m/s²]
 _WATER, _AIR, _VISCOSITY, _GRAVITY = 1025.0, 1.23, 1.19e-6, 9.81
 # service speed as a Froude number where the vessel file states none: merchant ships steered by
@@ -230,10 +228,10 @@ def semi_empirical_model(vessel: Vessel) -> ManoeuvringModel:
     theta = step * np.array([rates.get(n, 0.0) for n in structure.parameters])
     std = _standard_errors(structure, theta, vessel, hull)
     notes = (
-        f"{NO_TRIAL}the model comes from length {hull.length:g} m, beam {hull.beam:.3g} "
-        f"m, draught {hull.draught:.3g} m, {hull.mass:.3g} kg and service speed {hull.speed:.3g} "
-        f"m/s by the formulas of Clarke, Gedling and Hine (1983), ITTC (1957) and Hoerner (1965), "
-        f"each coefficient uncertain by a fifth to a half of itself",
+        f"the model comes from length {hull.length:g} m, beam {hull.beam:.3g} m, draught "
+        f"{hull.draught:.3g} m, {hull.mass:.3g} kg and service speed {hull.speed:.3g} m/s by the "
+        f"formulas of Clarke, Gedling and Hine (1983), ITTC (1957) and Hoerner (1965), each "
+        f"coefficient uncertain by a fifth to a half of itself",
         *hull.notes,
     )
     return ManoeuvringModel(
