@@ -467,8 +467,7 @@ def _ship(problem: Problem, choice: TermChoice, base: Fit, pushed: float) -> Shi
     scale = problem.sample_time / choice.logs[0].sample_time
     theta = np.zeros(len(ship.theta))
     for term, value in zip(terms.structure.terms, terms.start, strict=True):
-        of_thrust = any(f.signal in problem.structure.inputs for f in term.factors)
-        theta[problem.place(term.name)] = value * scale * (pushed if of_thrust else 1.0)
+        theta[problem.place(term.name)] = value * scale * pushed**term.of_thrust
     return replace(ship, theta=theta, current=np.zeros(len(CURRENTS)))
 
 

@@ -197,6 +197,11 @@ class Term:
         return any(f.signal in _AIR for f in self.factors)
 
     @property
+    def of_thrust(self) -> int:
+        """How many of its factors are in proportion to the thrust; a rudder's angle is none."""
+        return sum(_UNITS[f.signal][2] for f in self.factors if f.signal in _UNITS)
+
+    @property
     def key(self) -> tuple[str, tuple[tuple[str, bool, float, float, float], ...]]:
         """Equation and factors without order: equal for terms that are the same function."""
         return self.state, tuple(

@@ -306,6 +306,8 @@ def gain_picture(gain: Mapping[str, Gain], where: str = "") -> Picture:
     caption = f"Fit of the free run before and after{where}, with the 95 % interval of the gain."
     if any(min(g.before, g.after) < LOWEST_FIT for g in gain.values()):
         caption += f" Below {LOWEST_FIT:.0f} % it is drawn at the edge."
+    if any(percent(g.before) == "diverged" for g in gain.values()):
+        caption += " A run that diverged has no interval."
     rows = _gain_table("", gain, ("before", "after")).rows
     told = "; ".join(f"{r[0]} {r[1]} to {r[2]}" for r in rows)
     return narrow(gain_figure(gain), "gain", caption, f"{caption} {told}.")

@@ -27,6 +27,7 @@ from greybox.report.figures import (
 )
 from greybox.report.free_run_errors import REGIMES, Errors, simulated, simulations
 from greybox.report.thinning import find_gaps
+from greybox.validation.fit import LEFT
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -229,9 +230,10 @@ def gain_figure(gain: Mapping[str, Gain]) -> Figure:
     ax = figure.subplots()
     for i, g in enumerate(gain.values()):
         before, after = max(g.before, LOWEST_FIT), max(g.after, LOWEST_FIT)
-        low, high = (max(g.before + c, LOWEST_FIT) for c in g.ci)
         ax.plot([before, after], [i, i], color="0.6", linewidth=1.5, zorder=1)
-        ax.plot([low, high], [i, i], color=SKY, linewidth=6, alpha=0.8, zorder=2,
+        # what is gained on a run that leaves every bound has no size
+        ends = [np.clip(g.before + c, LOWEST_FIT, 100) for c in g.ci] if g.before > LEFT else []
+        ax.plot(ends, [i] * len(ends), color=SKY, linewidth=6, alpha=0.8, zorder=2,
                 solid_capstyle="butt", label="gain, 95 %" if i == 0 else None)  # fmt: skip
         for name, value in (("before", before), ("after", after)):
             ax.plot(

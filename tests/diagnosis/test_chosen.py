@@ -16,16 +16,21 @@ from greybox.diagnosis.chosen import (
     _known_columns,
     _law,
     _own_share,
+    _ship,
     _told_apart,
     _with_sensors,
 )
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.search import Candidate, _of_the_ship
+from greybox.diagnosis.ship import Ship
 from greybox.model.run.step import MONOTONE, Integrator
+from greybox.model.terms import parse_term
 from greybox.study.blind import draw
 from greybox.trial.log import TrialLog
+from greybox.vessel.force import generalised_force
 from greybox.vessel.thrust import ThrustLaw
+from greybox.vessel.vessel import Thruster, Vessel
 
 BIAS, ARM = 0.06, (-0.9, 0.4)
 
@@ -190,3 +195,28 @@ def test_a_chosen_thrust_law_keeps_its_force(law: ThrustLaw) -> None:
     speeds = np.array([-14.0, 3.0, 20.0])
     for n in speeds:
         assert pushed * float(ours.force(n)) == pytest.approx(float(law.force(n)))
+
+
+def test_a_chosen_rudder_keeps_its_force() -> None:
+    def ship(law: ThrustLaw) -> Vessel:
+        screw = Thruster("propeller_rudder", -1.5, 0.0, "n", rudder="delta", thrust=law)
+        return Vessel("tanker", 3.0, (screw,))
+
+    chosen, ours = ship(ThrustLaw("quadratic")), ship(ThrustLaw(quadratic_share=1.0, reference=8.0))
+    names = ("Xmu", "X_race_drag", "X_|u|u*rudder_drag", "N_race", "N_|u|u*rudder", "N_u*race")
+    terms = [parse_term(name) for name in names]
+    choice = SimpleNamespace(
+        terms=SimpleNamespace(structure=SimpleNamespace(terms=terms), start=np.arange(1.0, 7.0)),
+        logs=[SimpleNamespace(sample_time=0.5)],
+    )  # fmt: skip
+    problem = SimpleNamespace(sample_time=0.5, place=names.index)
+    begun = Ship(np.zeros(len(names)), np.zeros(2), ours)
+    base = SimpleNamespace(point=SimpleNamespace(base=begun))
+    made = _ship(cast(Any, problem), cast(Any, choice), cast(Any, base), 8.0)
+    commands = {"n": np.array([3.0, 8.0, 12.0]), "delta": np.array([0.1, -0.3, 0.5])}
+    theirs, mine = (generalised_force(v, commands) for v in (chosen, ours))
+    for name, term, value in zip(names, terms, choice.terms.start, strict=True):
+        signal = next(f.signal for f in term.factors if f.signal in theirs)
+        assert made.theta[names.index(name)] * mine[signal] == pytest.approx(
+            value * theirs[signal]
+        ), name

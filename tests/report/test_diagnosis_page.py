@@ -28,7 +28,7 @@ from greybox.model.run.changes import Change
 from greybox.notebook import with_error
 from greybox.report.diagnosed_causes import probability
 from greybox.report.diagnosis import diagnosis_page
-from greybox.report.diagnosis_figures import command_figure, most_followed
+from greybox.report.diagnosis_figures import command_figure, gain_figure, most_followed
 from greybox.report.error_budget import budget_figure, budget_in_words, budget_table, largest
 from greybox.report.error_profiles import block_ids, memory, profile
 from greybox.report.free_run_errors import gather
@@ -324,6 +324,16 @@ def test_confused(told):
     assert "heading_bias looks like sway in proportion to surge" in shown
     assert "sway from diverged to 79.3 %" in shown
     assert "drawn at the edge" in shown
+    assert "A run that diverged has no interval." in shown
+
+
+def test_a_gain_is_drawn_up_to_a_perfect_fit():
+    gain = {
+        "u": Gain(-30.0, 80.0, (90.0, 240.0)), "v": Gain(-2000.0, 60.0, (1500.0, 2600.0))
+    }  # fmt: skip
+    ax = gain_figure(gain).axes[0]
+    intervals = [line.get_xdata() for line in ax.lines if line.get_linewidth() == 6]
+    assert [list(x) for x in intervals] == [[60.0, 100.0], []]
 
 
 def test_unexplained(told):
