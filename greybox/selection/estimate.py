@@ -22,6 +22,7 @@ from greybox.estimation.output_error import OutputErrorOptions
 from greybox.estimation.prediction_verdict import (
     NOT_JUDGED,
     Elsewhere,
+    HeldCommandsDiverge,
     LargeError,
     PredictionLevel,
     RefitsDiverge,
@@ -249,7 +250,7 @@ def _level_of(estimate: Estimate) -> PredictionLevel:
 def _leaves_more(estimate: Estimate) -> bool:
     """Whether free runs on what took no part err by more than the sensors' noise explains."""
     judged = estimate.prediction or NOT_JUDGED
-    told = LargeError | RunsDiverge | RefitsDiverge | Divergence | Elsewhere
+    told = LargeError | RunsDiverge | RefitsDiverge | Divergence | HeldCommandsDiverge | Elsewhere
     if any(isinstance(r, told) for r in judged.because):
         return True
     if ESTIMATORS[estimate.method].instruments:

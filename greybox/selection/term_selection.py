@@ -24,12 +24,14 @@ from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.numerics.effort import Shares, seconds_left, within
 from greybox.numerics.parallel import Piece, Result, lanes, map_forked
+from greybox.regression.instruments import state_bound
 from greybox.selection.cross_validation import Refit, parts_of
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected
 from greybox.selection.held_out import extent, folds, rank, spread_of
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
+from greybox.validation.held_commands import held_commands
 from greybox.vessel.force import force_inputs
 from greybox.vessel.thrust import ThrustLaw, typical_speed
 from greybox.vessel.vessel import Between
@@ -257,15 +259,14 @@ def select_terms(
     by_logs = len(parts_of(logs))
     weight = np.ones(len(parts))
     weight[by_logs:] = by_logs / max(len(parts) - by_logs, 1)
-    ranking = rank(
-        [np.array(s) * weight / weight.mean() for s in (present_score, *scores)],
-        [0, *(n for _, n in alternatives)],
-        given_away=_GIVEN_AWAY,
-    )
-    chosen = ranking.chosen
+    judged_by = [np.array(s) * weight / weight.mean() for s in (present_score, *scores)]
+    preferred = [0, *(n for _, n in alternatives)]
+    ranking = rank(judged_by, preferred, given_away=_GIVEN_AWAY)
+    sets = [_of_size(whole[b], n) for b, n in alternatives]
+    chosen, left_out = _staying(ranking.chosen, judged_by, preferred, sets, (logs, family, kind))
     shown = chosen or int(np.argmax(ranking.score[1:])) + 1
     begun, size_shown = alternatives[shown - 1]
-    best = _of_size(whole[begun], size_shown)
+    best = sets[shown - 1]
     assert best is not None
     shorter = [_of_size(path[begun], size_shown) for path in paths]
     named = {name for found in shorter if found for name in found.terms}
@@ -293,7 +294,6 @@ def select_terms(
     step = next((s for s, _, behind, se in steps if behind <= max(se, near)), own)
     logs = with_commands(logs, step.commands)
     fit = 100 * (1 - np.exp(-ranking.score / 100))
-    sets = [_of_size(whole[b], n) for b, n in alternatives]
     means = selection.model.means
     # a mean current or wind is no term
     counts = [size, *(sum(n not in means for n in s.terms) for s in sets if s)]
@@ -321,6 +321,11 @@ def select_terms(
             else f"{present} stays."
         )
     )
+    if left_out:
+        said += (
+            f" {left_out} larger set{'s' if left_out > 1 else ''} ran away with commands of the "
+            f"logs held constant, and none was taken."
+        )
     if step != own:
         said += (
             f" Steps by {step.integrator} with commands {step.commands} between samples predict "
@@ -448,6 +453,47 @@ def _moving(
     ratio = np.mean(np.square(errors), axis=1) / spread[moves] ** 2
     rests = (ratio >= 1) & (ratio > _LOST * ratio.min(axis=0))
     return [a for a, still in zip(alternatives, rests.any(axis=1), strict=True) if not still]
+
+
+def _staying(
+    chosen: int,
+    scores: Sequence[Array],
+    preferred: Sequence[int],
+    sets: Sequence[Selected | None],
+    family: tuple[Sequence[TrialLog], Structure, str],
+) -> tuple[int, int]:
+    """Return the choice among sets whose runs stay bounded with commands of the logs held.
+
+    Beside it how many that were preferred do not. Terms may follow all parts of a log and drive
+    the ship where it never stayed. The first choice stands where none stays that is better than
+    the present model.
+
+    Parameters
+    ----------
+    chosen : int
+        The first choice, counted from the present model.
+    scores, preferred
+        Of the present model and of each set, see `rank`.
+    sets : sequence of Selected or None
+    family : tuple
+        The logs, the structure and the predictor that the sets are of.
+    """
+    logs, structure, kind = family
+    held = held_commands(logs)
+    if not chosen or not held:
+        return chosen, 0
+    runs = FreeRunSelection(held, structure, kind)
+    bound = state_bound(held[0], structure.states)
+    left: list[Array | None] = [*scores]
+    now = chosen
+    while now:
+        found = sets[now - 1]
+        assert found is not None
+        if not runs.escapes(found.p, bound):
+            return now, len(left) - sum(s is not None for s in left)
+        left[now] = None
+        now = rank(left, preferred, given_away=_GIVEN_AWAY).chosen
+    return chosen, 0
 
 
 def _error(sets: Sequence[Selected], size: int) -> float:

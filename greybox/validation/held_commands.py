@@ -40,24 +40,46 @@ def held_commands_diverge(
     HeldCommandsDiverge or None
         None where all runs stay bounded; `SomeHeldDiverge` where few do not.
     """
-    longest = max(logs, key=len)
-    names = [n for n in longest.vessel.commands if all(n in log for log in logs)]
-    if not names:
-        return None
+    settings = held_commands(logs)
     left: list[tuple[float, dict[str, float]]] = []
-    settings = _unlike(np.concatenate([np.stack([g[n] for n in names], 1) for g in logs]))
-    for values in settings:
-        held = {n: float(v) for n, v in zip(names, values, strict=True)}
-        constant = {n: np.full(len(longest), v) for n, v in held.items()}
-        run = run_model(model, replace(longest, channels={**longest.channels, **constant}))
+    for log in settings:
+        run = run_model(model, log)
         if run.diverged >= 0:
-            left.append((float(run.log.t[run.diverged] - run.log.t[0]), held))
+            held = {n: float(log[n][0]) for n in log.vessel.commands if n in log}
+            left.append((float(log.t[run.diverged] - log.t[0]), held))
     if not left:
         return None
     after, commands = min(left, key=lambda found: found[0])
     many = len(left) > LIMITS.held * len(settings)
     told = HeldCommandsDiverge if many else SomeHeldDiverge
     return told(commands, after, len(left), len(settings))
+
+
+def held_commands(logs: Sequence[TrialLog]) -> list[TrialLog]:
+    """Return the longest log with commands held at settings that the logs had at one time.
+
+    Parameters
+    ----------
+    logs : sequence of TrialLog
+
+    Returns
+    -------
+    list of TrialLog
+        Up to 16, the settings as unlike one another as the logs allow; none without commands.
+    """
+    longest = max(logs, key=len)
+    names = [n for n in longest.vessel.commands if all(n in log for log in logs)]
+    if not names:
+        return []
+    settings = _unlike(np.concatenate([np.stack([g[n] for n in names], 1) for g in logs]))
+    return [
+        replace(
+            longest,
+            channels={**longest.channels}
+            | {n: np.full(len(longest), v) for n, v in zip(names, values, strict=True)},
+        )
+        for values in settings
+    ]
 
 
 def _unlike(settings: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,6 +12,7 @@ from virtual import virtual_log
 
 from greybox.commands.common import read_logs
 from greybox.estimation.output_error import OutputErrorOptions
+from greybox.estimation.prediction_verdict import SomeHeldDiverge
 from greybox.model.catalogue import get_structure, structure_for
 from greybox.model.model import load_model
 from greybox.model.run.simulation import simulate
@@ -20,7 +21,7 @@ from greybox.selection.cross_validation import Refit, parts_of
 from greybox.selection.estimate import _leaves_more, at_own_pace, estimate_model, nominal_model
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected
-from greybox.selection.term_selection import _moving, select_terms
+from greybox.selection.term_selection import _moving, _staying, select_terms
 from greybox.trial.log import make_log
 from greybox.validation.fit import average_fit, run_model
 from greybox.vessel.force import force_inputs
@@ -171,6 +172,8 @@ def test_a_channel_that_moves_little_counts_by_its_error_beyond_noise(error, own
     assert _leaves_more(SimpleNamespace(method="oe", prediction=judged)) is leaves
     # errors of instruments are the noise of their coefficients
     assert not _leaves_more(SimpleNamespace(method="iv", prediction=judged))
+    judged.because = (SomeHeldDiverge({"n": 10.0}, 60.0, 1, 16),)
+    assert _leaves_more(SimpleNamespace(method="iv", prediction=judged))
 
 
 def test_logs_are_taken_at_the_pace_of_the_ship():
@@ -318,3 +321,21 @@ def test_a_set_that_rests_in_a_channel_that_others_follow_is_not_chosen() -> Non
     # what none of them follows, or hardly, excludes none
     whole = [sets((0.4, 0.1), (0.5, 0.09)), sets((0.6, 0.11))]
     assert _moving(Runs(), whole, every, spread) == every
+
+
+def test_a_set_that_runs_away_where_commands_are_held_is_not_chosen(modulus_log) -> None:
+    logs, family = [modulus_log], get_structure("linear")
+    names = FreeRunSelection(logs, family, "basic").names
+    values = {"Xu": -0.02, "Xmu": 1e-3, "Yv": -0.1, "Ymu": 1e-3, "Nr": -0.1, "Nmu": 1e-4}
+    calm, driven = (
+        Selected(tuple(names), np.array([(values | {"Nr": nr}).get(n, 0.0) for n in names]), 0.1)
+        for nr in (-0.1, 0.2)
+    )
+    scores = [np.full(4, s) for s in (-50.0, -20.0, -10.0)]
+    of = (logs, family, "basic")
+    assert _staying(2, scores, [0, 8, 9], [calm, driven], of) == (1, 1)
+    assert _staying(2, scores, [0, 8, 9], [driven, calm], of) == (2, 0)
+    # where none stays, or only the present model is better, the choice stands
+    assert _staying(2, scores, [0, 8, 9], [driven, driven], of) == (2, 0)
+    assert _staying(2, [scores[1], scores[0], scores[2]], [0, 8, 9], [calm, driven], of) == (2, 0)
+    assert _staying(0, scores, [0, 8, 9], [calm, driven], of) == (0, 0)
