@@ -323,8 +323,8 @@ def select_terms(
     )
     if left_out:
         said += (
-            f" {left_out} larger set{'s' if left_out > 1 else ''} ran away with commands of the "
-            f"logs held constant, and none was taken."
+            f" {left_out} set{'s' if left_out > 1 else ''} preferred to it ran away with commands "
+            f"of the logs held constant."
         )
     if step != own:
         said += (
