@@ -27,7 +27,7 @@ Metric = Literal["coloured", "free run"]
 
 # a step that promises less than this of −2 log L ends the search
 _ENOUGH = 0.02
-_MOST = 25
+MOST = 25
 # a point that −2 log L tells from another by less than this has its derivatives
 _NEAR = 1.0
 # a fall of −2 log L that differs from what its step promised by less than this share shows that
@@ -301,7 +301,7 @@ class Problem:
             before += len(start)
         return out
 
-    def fit(self, point: Point, noise: Noise, most: int = _MOST, than: float | None = None) -> Fit:
+    def fit(self, point: Point, noise: Noise, most: int = MOST, than: float | None = None) -> Fit:
         """Minimise −2 log L over the free numbers at a given noise.
 
         Parameters

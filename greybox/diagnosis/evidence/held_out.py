@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.fitting import Problem
+from greybox.diagnosis.fitting import MOST, Problem
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import Ship
 from greybox.model.run.step import Integrator
@@ -121,6 +121,10 @@ class HeldOut(ABC):
         """Return among how many readings of a hypothesis the likeliest was taken."""
         return 1
 
+    def exchanged(self) -> HeldOut | None:
+        """Return the same with the logs' roles exchanged; None where all were held out already."""
+        return None
+
 
 def worse(held_out: Callable[[Integrator], HeldOut], fit: Fit, than: Fit) -> float:
     """Return the mean logarithm of the ratio of squared held-out errors of two fits.
@@ -198,6 +202,10 @@ class OtherLogs(HeldOut):
     def _ways(self, fit: Fit) -> int:
         return len(change_scenarios(fit.point))
 
+    def exchanged(self) -> HeldOut | None:
+        """Return the logs that the model was fitted to, each fit made anew on the others."""
+        return Folds([(self.problem, self.fitting)], MOST)
+
 
 def change_scenarios(point: Point) -> list[Ship]:
     """Return the ship with its changes within the log, and with them made before."""
@@ -217,16 +225,18 @@ class Folds(HeldOut):
     ----------
     parts : sequence of (Problem, Problem)
         To fit on, and held out.
+    most : int
+        Iterations of a fit at most: few change what differs little from the fit to all.
     """
 
-    def __init__(self, parts: Sequence[tuple[Problem, Problem]]) -> None:
+    def __init__(self, parts: Sequence[tuple[Problem, Problem]], most: int = 10) -> None:
         super().__init__()
-        self.parts = tuple(parts)
+        self.parts, self.most = tuple(parts), most
 
     def _pairs(self, fit: Fit) -> list[Pair]:
         out = []
         for fitting, held in self.parts:
             starts = tuple(run.start() for run in fitting.runs)
-            refitted = fitting.fit(replace(fit.point, starts=starts), fit.noise, most=10)
+            refitted = fitting.fit(replace(fit.point, starts=starts), fit.noise, self.most)
             out.append(Pair(fitting, refitted, held, held.fit_starts(refitted.point, fit.noise)))
         return out

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,11 +89,22 @@ class Standing:
     @property
     def stands(self) -> bool:
         """Whether the cause explains what no generic force explains as well."""
-        gains = self.beyond.gain > 0 and self.beyond.p_value < self.level
-        own = self.share is not None and self.share >= OWN_SHARE and self.half < self.level
-        beside = (gains or own) and self.clear < PROVEN
+        beside = self._explains and self.clear < PROVEN
         # no force of motion and commands knows from where the wind blows
         return (beside or self.direction < PROVEN) and self._sure
+
+    @property
+    def open(self) -> bool:
+        """Whether more logs may yet tell that the cause stands."""
+        lacks = not self._explains and self.beyond.gain > 0
+        return lacks and not self.stands and self.clear < PROVEN and self._sure
+
+    @property
+    def _explains(self) -> bool:
+        """Whether it gains beyond a generic force, or takes what one of its arguments gains."""
+        gains = self.beyond.gain > 0 and self.beyond.p_value < self.level
+        own = self.share is not None and self.share >= OWN_SHARE and self.half < self.level
+        return gains or own
 
     @property
     def _sure(self) -> bool:
@@ -130,29 +141,59 @@ def standing(problem: Problem, hypothesis: Hypothesis, with_it: Fit, without_it:
         proof = proof_of(np.array([np.inf if better else -np.inf]))
         return Standing(proof, None, 1.0, moved, clear, told, level, PROVEN, tried, sought)
     use = _own_arguments(problem, hypothesis)
-    for pair in without:
-        fit_generic_forces(pair, [rival, *([] if use is None else [use])])
-    beside = [contributions_beside(p, rival) for p in pairs]
-    beyond = proof_of(np.concatenate([contributions_beside(p, rival) for p in without])
-                      - np.concatenate(beside))  # fmt: skip
-    share, half = None, 1.0
-    if use is not None:
-        plain = np.concatenate([np.concatenate(p.held.contributions(p.held_fit)) for p in without])
-        own = np.concatenate([np.concatenate(p.held.contributions(p.held_fit)) for p in pairs])
-        generic = np.concatenate([contributions_beside(p, use) for p in without])
-        gained, could = plain - own, plain - generic
-        share = float(gained.sum() / could.sum()) if could.sum() > 0 else np.inf
-        half = proof_of(gained - LEAST_SHARE * could).p_value
+    gains = _gains(pairs, without, rival, use)
     direction = 1.0
     if any(parse_term(n).of_air for n in hypothesis.columns if n not in CURRENTS):
         direction = wind_direction(problem, hypothesis, without_it, held_out)
     # every ship has such terms; that a log or the vessel file is wrong, or what heading, time and
     # earlier commands do, must be surer
-    of_hull = hypothesis.apply is None and share is not None
+    of_hull = hypothesis.apply is None and use is not None
     known = SAME if of_hull or direction < PROVEN else PROVEN
-    return Standing(
-        beyond, share, half, moved, clear, told, level, known, tried, sought, direction
+    weight = Standing(
+        *_told(gains), moved, clear, told, level, known, tried, sought, direction
     )  # fmt: skip
+    other = held_out.exchanged() if weight.open and not with_it.noise.coloured else None
+    if other is None or with_it.point.ship.changes:
+        return weight
+    # few samples are independent: the logs that the model was fitted to are asked in turn
+    pairs, without = other.pairs(with_it), other.pairs(without_it)
+    if any(p.held_fit.escaped or p.fit.escaped for p in (*pairs, *without)):
+        return weight
+    both = np.hstack([gains, _gains(pairs, without, rival, use)])
+    beyond, share, half = _told(both)
+    return replace(weight, beyond=beyond, share=share, half=half)
+
+
+def _gains(pairs: Sequence[Pair], without: Sequence[Pair], rival: Use, use: Use | None) -> Array:
+    """Return what each held-out sample adds to falls of −2 log L, (1 or 3, N).
+
+    By a cause where a generic force stands beside both models; by the cause alone, and by a generic
+    force of its own arguments alone, where it has such.
+    """
+    for pair in without:
+        fit_generic_forces(pair, [rival, *([] if use is None else [use])])
+
+    def plain(of: Sequence[Pair]) -> Array:
+        return np.concatenate([np.concatenate(p.held.contributions(p.held_fit)) for p in of])
+
+    def beside(of: Sequence[Pair], force: Use) -> Array:
+        return np.concatenate([contributions_beside(p, force) for p in of])
+
+    beyond = beside(without, rival) - beside(pairs, rival)
+    if use is None:
+        return beyond[None]
+    alone = plain(without)
+    return np.stack([beyond, alone - plain(pairs), alone - beside(without, use)])
+
+
+def _told(gains: Array) -> tuple[Proof, float | None, float]:
+    """Return what gains, see `_gains`, say: proof beyond the generic force, share, its p-value."""
+    beyond = proof_of(gains[0])
+    if len(gains) == 1:
+        return beyond, None, 1.0
+    gained, possible = gains[1:]
+    share = float(gained.sum() / possible.sum()) if possible.sum() > 0 else np.inf
+    return beyond, share, proof_of(gained - LEAST_SHARE * possible).p_value
 
 
 def _rival(problem: Problem, hypothesis: Hypothesis) -> Use:
