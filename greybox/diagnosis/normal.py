@@ -25,18 +25,25 @@ def bounded_step(normal: Array, gradient: Array, low: Array, high: Array, dampin
     damping : float
         Levenberg-Marquardt share.
     """
-    step = np.zeros(len(gradient))
-    free = np.ones(len(gradient), bool)
-    for _ in range(len(gradient)):
-        part = np.ix_(free, free)
-        right = gradient[free] - normal[np.ix_(free, ~free)] @ step[~free]
-        step[free] = _solve(normal[part], right, damping)
-        outside = free & ((step < low) | (step > high))
-        if not outside.any():
-            break
-        step[outside] = np.clip(step, low, high)[outside]
-        free &= ~outside
-    return step
+    from scipy.optimize import lsq_linear
+
+    scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
+    scale[scale == 0] = 1.0
+    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    known = values > _UNKNOWN
+    root, basis = np.sqrt(values[known] + damping), vectors[:, known]
+    right = (basis.T @ (gradient / scale)) / root
+    step = np.asarray(basis @ (right / root) / scale)
+    if ((low <= step) & (step <= high)).all():
+        return step
+    # those that stop move what is best for the others, and some of them off their bounds again
+    step = np.clip(np.zeros(len(gradient)), low, high)
+    free = low < high
+    rows = root[:, None] * basis.T
+    limits = (low[free] * scale[free], high[free] * scale[free])
+    away = right - rows[:, ~free] @ (step[~free] * scale[~free])
+    step[free] = lsq_linear(rows[:, free], away, limits, method="bvls").x / scale[free]
+    return np.clip(step, low, high)
 
 
 def inverses(normal: Array) -> tuple[Array, Array]:
@@ -55,11 +62,3 @@ def inverses(normal: Array) -> tuple[Array, Array]:
     )
     one, two = (part / np.outer(scale, scale) for part in parts)
     return one, two
-
-
-def _solve(normal: Array, right: Array, damping: float) -> Array:
-    scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
-    scale[scale == 0] = 1.0
-    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
-    inverse = np.where(values > _UNKNOWN, 1 / (np.maximum(values, _UNKNOWN) + damping), 0.0)
-    return np.asarray(vectors @ (inverse * (vectors.T @ (right / scale))) / scale)

@@ -59,6 +59,24 @@ def test_what_makes_a_cause_stand(beyond, share, half, clear, told, known, stand
     assert found.stands is stands
 
 
+@pytest.mark.parametrize(
+    ("beyond", "half", "clear", "told", "more"),
+    [
+        ((3.0, 0.2), 0.2, 1e-9, 1e-9, True),
+        # it stands, or held-out logs speak against it
+        ((3.0, 0.01), 0.2, 1e-9, 1e-9, False),
+        ((3.0, 0.2), 0.01, 1e-9, 1e-9, False),
+        ((-3.0, 0.8), 0.2, 1e-9, 1e-9, False),
+        # no log would make it stand
+        ((3.0, 0.2), 0.2, 0.2, 1e-9, False),
+        ((3.0, 0.2), 0.2, 1e-9, 0.2, False),
+    ],
+)
+def test_more_logs_are_asked_only_where_they_may_decide(beyond, half, clear, told, more) -> None:
+    found = Standing(proof(*beyond), 0.9, half, np.zeros(1), clear, told)
+    assert found.open is more
+
+
 def test_what_makes_held_out_logs_less_likely_has_no_name() -> None:
     def candidate(gain: float) -> SimpleNamespace:
         return SimpleNamespace(
@@ -182,6 +200,36 @@ def test_a_current_stands_because_no_force_of_motion_knows_the_heading(sailed) -
     assert found.stands
     assert found.share is None
     assert found.moved.shape == (len(problem.numbers_of(fit.point, hypothesis)),)
+
+
+def test_logs_that_a_model_was_fitted_to_are_held_out_in_turn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    trial = draw(np.random.default_rng([3, 2]), ("uneven_damping",), samples=600)
+    ready = prepare([trial.estimation], [trial.validation], None, "thesis", None)
+    base = ready.base()
+    case = ready.case.wider((), "free run")
+    problem, held = case.problem(base.integrator), case.held_out(base.integrator)
+    hypothesis = next(a for a in ready.hypotheses if a.cause == "current")
+    start = case.carried(base)
+    without = problem.settle(start)
+    fit = problem.settle(problem.fit(problem.add(start.point, hypothesis), without.noise))
+    alone = standing(problem, hypothesis, fit, without, held, 20)
+    other = held.exchanged()
+    assert other is not None
+    (pair,) = other.pairs(fit)
+    # on the other log the same numbers are free, and they are those of that log
+    assert pair.held is problem
+    assert pair.problem is held.problem
+    assert pair.fit.point.ship.current != pytest.approx(fit.point.ship.current, rel=1e-6)
+    assert pair.fit.converged
+    assert other.exchanged() is None
+    monkeypatch.setattr(Standing, "open", True)
+    both = standing(problem, hypothesis, fit, without, held, 20)
+    counts = [sum(len(run.y) for run in p.runs) for p in (held.problem, problem)]
+    assert len(alone.beyond.samples) == counts[0]
+    np.testing.assert_array_equal(both.beyond.samples[: counts[0]], alone.beyond.samples)
+    assert len(both.beyond.samples) == sum(counts)
 
 
 def test_a_generic_force_takes_most_of_what_no_term_is_there_for() -> None:
