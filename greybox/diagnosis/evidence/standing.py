@@ -61,7 +61,8 @@ class Standing:
         p-value of the null (Wald) where it is likeliest on the way that the generic force moves
         the numbers.
     told : float
-        That of the surest of the numbers with its movement counted as a standard error.
+        That of the surest of its numbers with its movement counted as a standard error, corrected
+        for how many there are.
     level : float
         Significance that a gain on held-out logs must have.
     known : float
@@ -224,6 +225,10 @@ def _moved(
     scatter = np.sqrt(np.mean([_scatter(p, hypothesis) for p in bounded], axis=0))
     whole = np.hypot(every[where], scatter)
     away, own, along = problem.effect(fit, hypothesis)
+    if hypothesis.apply is None:
+        # what becomes free with a cause says nothing of it
+        mine = len(hypothesis.columns)
+        away, own, along = away[:mine], own[:mine, :mine], along[:mine]
     if not np.isfinite(own).all() or not len(away):
         return whole, *[1.0 if len(away) else 0.0] * 2
     coarse = np.zeros(len(where))
@@ -237,7 +242,8 @@ def _moved(
     near = away + share * far
     passed = float(chdtrc(len(away), float(near @ inverse @ near)))
     told = away**2 / np.maximum(np.diag(own) + far**2 + (apart**2).sum(axis=1), 1e-300)
-    return whole, passed, float(chdtrc(1, told.max()))
+    # the surest of several is sure by chance as often as there are numbers (Šidák, 1967)
+    return whole, passed, float(-np.expm1(len(told) * np.log1p(-chdtrc(1, told.max()))))
 
 
 def _scatter(pair: Pair, hypothesis: Hypothesis) -> Array:
