@@ -17,6 +17,7 @@ from greybox.diagnosis.evidence.remainder import (
     generic_force,
 )
 from greybox.diagnosis.evidence.standing import Standing, _own_arguments, _rival, standing
+from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.search import FIRST, Search, _stands, weighed
 from greybox.diagnosis.thresholds import PROVEN, SAME
@@ -200,6 +201,24 @@ def test_a_current_stands_because_no_force_of_motion_knows_the_heading(sailed) -
     assert found.stands
     assert found.share is None
     assert found.moved.shape == (len(problem.numbers_of(fit.point, hypothesis)),)
+
+
+def test_what_becomes_free_with_a_cause_is_no_evidence_of_it(
+    sailed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ready, base, problem, hypothesis, fit = sailed
+    assert hypothesis.co_freed
+    held = ready.case.held_out(fit.integrator)
+    effect = Problem.effect
+
+    def no_current(*given):
+        away, own, along = effect(*given)
+        away[: len(hypothesis.columns)] = 0.0
+        return away, own, along
+
+    assert standing(problem, hypothesis, fit, base, held, 20).told < 1e-6
+    monkeypatch.setattr(Problem, "effect", no_current)
+    assert standing(problem, hypothesis, fit, base, held, 20).told == pytest.approx(1.0)
 
 
 def test_logs_that_a_model_was_fitted_to_are_held_out_in_turn(

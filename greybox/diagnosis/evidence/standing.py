@@ -215,7 +215,7 @@ def _moved(
     problem: Problem, hypothesis: Hypothesis, fit: Fit, pairs: Sequence[Pair], rival: Use
 ) -> tuple[Array, float, float]:
     """Return how far a hypothesis's numbers move, and two p-values of their null."""
-    from scipy.special import chdtrc
+    from scipy.special import chdtr, chdtrc
 
     where = problem.numbers_of(fit.point, hypothesis)
     bounded = [p for p in pairs if not (p.fit.escaped or p.held_fit.escaped)]
@@ -243,7 +243,7 @@ def _moved(
     passed = float(chdtrc(len(away), float(near @ inverse @ near)))
     told = away**2 / np.maximum(np.diag(own) + far**2 + (apart**2).sum(axis=1), 1e-300)
     # the surest of several is sure by chance as often as there are numbers (Šidák, 1967)
-    return whole, passed, float(-np.expm1(len(told) * np.log1p(-chdtrc(1, told.max()))))
+    return whole, passed, float(1 - chdtr(1, told.max()) ** len(told))
 
 
 def _scatter(pair: Pair, hypothesis: Hypothesis) -> Array:
