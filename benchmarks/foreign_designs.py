@@ -8,8 +8,9 @@ prior, and a second trial of each kind is sailed and estimated with defaults, as
 
 Trials last sixty lengths, 5 to 15 min. `random` holds settings for half a length to two lengths,
 `zigzag` goes to both sides at three speeds, `plan` is `greybox design`; `long-` is half as long
-again. What stands in DIR is not made again. Errors are those of free runs over one long trial of
-the operating envelope: random steps, zig-zags and turns, to both sides at all speeds.
+again. `whole` is one plan of 15 min, `stages` three of 5 min, the later ones made by `--after` of
+those before. What stands in DIR is not made again. Errors are those of free runs over one long
+trial of the operating envelope: random steps, zig-zags and turns, to both sides at all speeds.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ SHIPS = (
     "kvlcc2-7m", "esso-osaka-3m", "training-ship-105m", "research-catamaran-29m",
     "survey-catamaran-2m",
 )  # fmt: skip
-ARMS = ("random", "zigzag", "plan", "long-random", "long-zigzag")
+ARMS = ("random", "zigzag", "plan", "long-random", "long-zigzag", "whole", "stages")
 # lengths sailed in a trial, its least and its greatest duration [s]
 TRIAL, SHORTEST, LONGEST = 60, 300.0, 900.0
 STEPS = random_steps(hold=(0.5, 2.0))
@@ -62,6 +63,8 @@ MANOEUVRES = {
 }  # fmt: skip
 # lengths of the trial that errors are measured by
 JUDGED = 200
+# plans that are made one after another, and the duration of each [s]
+STAGES, STAGE = 3, 300.0
 
 
 def greybox(*arguments: object) -> str:
@@ -75,45 +78,75 @@ def lasting(name: str, arm: str) -> float:
     scale = presets()[name].ship.time_scale
     if arm == "held-out":
         return float(round(JUDGED * scale))
+    if arm in ("whole", "stages"):
+        return STAGES * STAGE
     usual = round(min(max(TRIAL * scale, SHORTEST), LONGEST))
     return 1.5 * usual if arm.startswith("long") else float(usual)
 
 
-def sail(folder: Path, name: str, arm: str, seed: int) -> Path:
-    """Return the log of one trial."""
+def sail(folder: Path, name: str, arm: str, seed: int) -> list[Path]:
+    """Return the logs of one kind of trial."""
+    number = 100 * seed + sorted([*MANOEUVRES, "plan"]).index(arm if arm in MANOEUVRES else "plan")
+    if arm == "stages":
+        logs: list[Path] = []
+        for k in range(1, STAGES + 1):
+            # the first begins from what was known before, the others from what was sailed
+            made = _prior(folder, name, seed, STAGE)
+            if logs:
+                start = f"{_begun(logs[0])},0,0,0"
+                made = ("--after", *logs, "--remaining", STAGE, "--start", start)
+            logs.append(folder / f"stage-{k}.csv")
+            _sail_planned(logs[-1], name, made, number + k, seed)
+        return logs
     log = folder / f"{arm}.csv"
-    if log.exists():
-        return log
-    preset = presets()[name]
-    every = max(1, round(SAMPLE_TIMES[name] / preset.dt))
-    number = 100 * seed + sorted([*MANOEUVRES, "plan"]).index(arm)
-    duration = lasting(name, arm)
-    if arm != "plan":
-        preset.sail(MANOEUVRES[arm], duration, seed=number).write_csv(log, every)
-        return log
+    if arm in MANOEUVRES and not log.exists():
+        preset = presets()[name]
+        trial = preset.sail(MANOEUVRES[arm], lasting(name, arm), seed=number)
+        trial.write_csv(log, _every(name))
+    elif arm not in MANOEUVRES:
+        _sail_planned(log, name, _prior(folder, name, seed, lasting(name, arm)), number, seed)
+    return [log]
+
+
+def _every(name: str) -> int:
+    """Return how many steps of a simulator are between two logged samples."""
+    return max(1, round(SAMPLE_TIMES[name] / presets()[name].dt))
+
+
+def _prior(folder: Path, name: str, seed: int, duration: float) -> tuple[object, ...]:
+    """Return how a plan of some duration is made from the model of the first trial."""
     fit(folder, name, "first", seed)
-    plan, told = folder / "plan.plan.csv", folder / "plan.design.json"
-    greybox("design", "--vessel", folder / "vessel.toml", "--model", folder / "first.json",
-            "--duration", duration, "--out", plan, "--json", told, "--seed", seed,
-            "--workers", 1)  # fmt: skip
+    return ("--model", folder / "first.json", "--duration", duration)
+
+
+def _sail_planned(log: Path, name: str, made: Sequence[object], number: int, seed: int) -> None:
+    """Design a trial, and sail it from a straight course."""
+    if log.exists():
+        return
+    preset, plan = presets()[name], log.with_suffix(".plan.csv")
+    greybox("design", "--vessel", log.with_name("vessel.toml"), *made, "--out", plan,
+            "--json", log.with_suffix(".design.json"), "--seed", seed, "--workers", 1)  # fmt: skip
     rows = np.genfromtxt(plan, delimiter=",", names=True)
     commands = np.column_stack([rows[a.column] for a in preset.ship.actuators])
-    begun = json.loads(told.read_text())["starts"][0]["u"]
     trial = preset.sail(
-        table(rows["t"], commands), float(rows["t"][-1]), seed=number, start_speed=begun
+        table(rows["t"], commands), float(rows["t"][-1]), seed=number, start_speed=_begun(log)
     )
-    trial.write_csv(log, every)
-    return log
+    trial.write_csv(log, _every(name))
+
+
+def _begun(log: Path) -> float:
+    """Return the speed ahead from which a planned trial sets out [m/s]."""
+    return float(json.loads(log.with_suffix(".design.json").read_text())["starts"][0]["u"])
 
 
 def fit(folder: Path, name: str, arm: str, seed: int) -> list[float]:
     """Return the held-out fits of surge, sway and yaw rate of the model of one trial [%]."""
     told = folder / f"{arm}.fit"
     if not told.exists():
-        log = sail(folder, name, arm, seed)
-        greybox("estimate", log, "--vessel", folder / "vessel.toml",
+        logs = sail(folder, name, arm, seed)
+        greybox("estimate", *logs, "--vessel", folder / "vessel.toml",
                 "--out", folder / f"{arm}.json")  # fmt: skip
-        held = sail(folder, name, "held-out", seed)
+        (held,) = sail(folder, name, "held-out", seed)
         found = greybox("compare", folder / f"{arm}.json", "--log", held, "--json", "-")
         channels = json.loads(found)["models"][0]["fit"]
         # a run that diverges predicts nothing
@@ -164,7 +197,7 @@ def main() -> None:
     parser.add_argument("--out", required=True, type=Path)
     parser.add_argument("--ships", nargs="+", default=list(SHIPS), choices=sorted(presets()))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4])
-    parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=ARMS)
+    parser.add_argument("--arms", nargs="+", default=list(ARMS[:5]), choices=ARMS)
     options = parser.parse_args()
     found: dict[str, list[dict[str, list[float]]]] = {name: [] for name in options.ships}
     for seed in options.seeds:
