@@ -27,6 +27,7 @@ from greybox.diagnosis.thresholds import (
     NEAR,
     RELEVANT,
     SENSORS,
+    SIGNIFICANT,
     SURE,
     WORTH,
 )
@@ -121,8 +122,8 @@ def rule(
             f"held-out runs by {100 * taken:.0f} %"
         )
     named = tuple(c for c in stand if not _grouped(c, groups))
-    # one that makes held-out runs worse does not help
-    leaning = tuple(c for c in leaning if c.proof.gain > 0)
+    # one that makes held-out runs worse does not help, and one that may be chance is none
+    leaning = tuple(c for c in leaning if c.p_adjusted < SIGNIFICANT and c.proof.gain > 0)
     if named or known:
         verdict = DiagnosisVerdict.PARTLY if why else DiagnosisVerdict.NAMED
     elif groups:

@@ -39,6 +39,8 @@ def test_the_wind_is_found_in_a_tankers_trials(data_folder: Path, tmp_path: Path
     # what makes held-out runs worse is not told as a help
     helped = [c["held_out_gain"]["value"] for c in found["partial"]]
     assert all(value is None or value > 0 for value in helped)
+    # nor what may be chance
+    assert all(c["p_adjusted"] < 0.01 for c in found["partial"])
     # a pond has no current
     assert "current" not in {c["id"] for c in found["causes"]}
     # what the wind leaves decides whether it stands alone or only helps

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +20,8 @@ from greybox.diagnosis.evidence.remainder import (
 from greybox.diagnosis.evidence.standing import Standing, _own_arguments, _rival, standing
 from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.preparing import prepare
-from greybox.diagnosis.search import FIRST, Search, _stands, weighed
+from greybox.diagnosis.ruling import rule
+from greybox.diagnosis.search import FIRST, Search, _stands, assess_candidate, weighed
 from greybox.diagnosis.thresholds import PROVEN, SAME
 from greybox.study.blind import draw
 from greybox.vessel.vessel import Thruster, Vessel
@@ -310,6 +312,17 @@ def test_a_search_without_causes_is_left_as_it_is(sailed) -> None:
     ready, base, *_ = sailed
     found = Search(base, base, (), (), 1)
     assert weighed(ready.case, found) == found
+
+
+def test_what_may_be_chance_is_told_as_no_help(sailed) -> None:
+    ready, base, _, hypothesis, fit = sailed
+    held = ready.case.held_out
+    current = assess_candidate(held(fit.integrator).prove(base, fit), base, fit, hypothesis, 20)
+    assert current.p_adjusted < 1e-9
+    alike = replace(current, p_adjusted=0.2)
+    found = Search(base, base, (), (), 20, leaning=(current, alike))
+    ruled = rule(found, held, (), (), {}, None)
+    assert ruled.leaning == (current,)
 
 
 def test_beside_a_measured_wind_a_current_is_weighed_against_forces_of_the_air_too() -> None:
