@@ -168,6 +168,7 @@ def test_time_is_told_as_coarsely_as_it_is_known() -> None:
     assert told == ["a few seconds left", "about 20 s left", "about 2 min left", "about 2.5 h left"]
 
 
+@pytest.mark.long
 def test_the_bar_counts_down_and_leaves_processes_to_the_work() -> None:
     """It is drawn between two messages, and by no thread, beside which nothing could be shared."""
     script = """

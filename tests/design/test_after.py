@@ -147,6 +147,7 @@ def test_a_start_without_its_margin_is_named(request_) -> None:
     assert lacking_margin(slow) == "u"
 
 
+@pytest.mark.long
 def test_the_plan_covers_what_has_not_been_sailed(request_, model) -> None:
     request = replace(request_, covariance=None, effort=0.15)
     alone = design_for_prediction(request, model)

@@ -526,6 +526,7 @@ def test_a_trial_starts_on_the_fastest_course_that_its_cap_allows(envelope) -> N
     np.testing.assert_allclose(envelope.rollout.run(held).state[0, -1, :3], slow.starts[0][:3])
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("hasty")
 def test_a_course_is_begun_with_no_rudder_held_against_another() -> None:
     stern = Thruster(
@@ -548,6 +549,7 @@ def test_a_course_is_begun_with_no_rudder_held_against_another() -> None:
     assert begun.start_commands[0][1] == begun.start_commands[0][3] == 0
 
 
+@pytest.mark.long
 def test_the_closest_plan_where_no_other_is_found(model) -> None:
     room = TrialLimits(margins={"u": 0.2}, area=Circle(0.0, 0.0, 8.0))
     request = request_of(duration=60.0, effort=0.01, limits=room)

@@ -208,6 +208,7 @@ def test_where_nothing_acts_late_the_errors_are_those_before(pair: Pair) -> None
     np.testing.assert_allclose(same, before)
 
 
+@pytest.mark.long
 def test_a_lag_takes_what_the_logs_would_have_without_it() -> None:
     errors = {}
     for size in (1.0, 0.0):

@@ -220,6 +220,7 @@ def test_a_late_column_that_stands_in_another_ones_place_stays_late() -> None:
     assert found.actuation.lag_on == "n_star"
 
 
+@pytest.mark.long
 def test_a_slow_azimuth_is_named_with_its_place(tmp_path) -> None:
     trial = draw(
         np.random.default_rng([77, 1]), ("thruster_lag:alpha1",), kind="manoeuvres", samples=900

@@ -253,6 +253,7 @@ def test_logs_that_a_model_was_fitted_to_are_held_out_in_turn(
     assert len(both.beyond.samples) == sum(counts)
 
 
+@pytest.mark.long
 def test_a_generic_force_takes_most_of_what_no_term_is_there_for() -> None:
     trial = draw(np.random.default_rng([3, 2]), ("uneven_damping",), samples=900)
     ready = prepare([trial.estimation], [trial.validation], None, "thesis", ["crossflow"])

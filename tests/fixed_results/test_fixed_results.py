@@ -47,6 +47,7 @@ def test_a_number_that_moves_is_seen():
     assert difference({"theta": [1.0, -2.0]}, want)[0] == np.inf
 
 
+@pytest.mark.long
 def test_the_last_digit_of_a_log_decides_nothing(folder, tmp_path):
     """Refinements of parts of this log do not converge; where they end must not be chance."""
     (fixed,) = (f for f in COMMANDS if f.name == "iv-nominal")

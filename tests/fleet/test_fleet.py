@@ -148,6 +148,7 @@ def sailed(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_the_command_leaves_out_what_cannot_be_read_and_does_the_rest(sailed, capsys):
     table, result = sailed.parent / "table.csv", sailed.parent / "result.json"
     page = sailed.parent / "page.html"

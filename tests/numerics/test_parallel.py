@@ -252,6 +252,7 @@ def own_process(_: int) -> tuple[int, int]:
     return os.getpid(), len(map_forked(square, [1, 2]))
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_a_cluster_computes_the_same_though_a_worker_is_killed(cluster, tmp_path):
     seeds = list(range(24))

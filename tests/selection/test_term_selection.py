@@ -208,6 +208,7 @@ def catamaran(tmp_path_factory):
     return [read_logs([str(p)], vessel)[0] for p in paths]
 
 
+@pytest.mark.long
 def test_thrust_that_goes_with_the_square_of_the_speed_is_told(catamaran):
     logs = [log.window(0, 500, log.name) for part in catamaran[:3] for log in part]
     choice = select_terms(logs, "nothing", 0, Refit(lambda _: _still(logs[0])))
