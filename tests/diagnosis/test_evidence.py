@@ -195,9 +195,13 @@ def test_variances_stay_positive_where_numbers_are_hardly_known() -> None:
     rng = np.random.default_rng([907, zlib.crc32(b"dead_bandpulses"), 2])
     trial = draw(rng, ("dead_band",), kind="pulses")
     found = diagnose([trial.estimation], validate=[trial.validation])
-    # no cause is a dead band: thrust that grows faster than the speed is a part of it at most
+    # no cause is a dead band: of commands that all push one way, thrust that grows faster than the
+    # speed is a part of it, and so is a constant force against them
     assert found.verdict != "named"
-    assert {c.id for c in found.causes} <= {"quadratic_thrust"}
+    assert {c.id for c in found.causes} <= {"quadratic_thrust", "side_force"}
+    against = [c.parameters["Y_0"].value for c in found.causes if c.id == "side_force"]
+    push = trial.estimation["n1"] * np.sin(trial.estimation["alpha1"])
+    assert all(value * push.min() < 0 for value in against)
     stds = [q.std for c in (*found.causes, *found.candidates) for q in c.parameters.values()]
     assert np.isfinite(stds).all()
 
