@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.linear import NOWHERE
 from greybox.diagnosis.noise import Noise, fit_noise, free_run_noise
-from greybox.diagnosis.normal import bounded_step, inverses
+from greybox.diagnosis.normal import inverses
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import CURRENTS, LogRun, Ship
 from greybox.diagnosis.thresholds import DECIDED
 from greybox.model.run.step import MONOTONE
 from greybox.numerics.lagged_moments import automatic_lags, bartlett_sums
+from greybox.numerics.linalg import bounded_step
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

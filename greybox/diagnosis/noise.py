@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.diagnosis.normal import bounded_step
+from greybox.numerics.linalg import bounded_step
 from greybox.numerics.recursion import filtered, recursive
 from greybox.numerics.robust import white_noise
 

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from greybox.diagnosis.fitting import Problem, measured, stacked
 from greybox.diagnosis.hypothesis import Hypothesis
 from greybox.diagnosis.noise import Noise
-from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.point import Fit, Point
-from greybox.numerics.linalg import tall_svd
+from greybox.numerics.linalg import bounded_step, tall_svd
 from greybox.numerics.recursion import propagate
 
 Array = NDArray[np.float64]

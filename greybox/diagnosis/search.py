@@ -20,7 +20,6 @@ from greybox.diagnosis.evidence.remainder import MOTION_AND_COMMANDS, contributi
 from greybox.diagnosis.evidence.standing import Standing, level_of, standing
 from greybox.diagnosis.fitting import Problem, stacked
 from greybox.diagnosis.hypothesis import Hypothesis
-from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.null_model import DiagnosisProblem
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.refitting import (
@@ -45,6 +44,7 @@ from greybox.diagnosis.thresholds import (
     WORTH,
 )
 from greybox.model.run.step import Integrator
+from greybox.numerics.linalg import bounded_step
 from greybox.numerics.parallel import map_forked
 
 Array = NDArray[np.float64]

@@ -28,10 +28,10 @@ from greybox.estimation.shooting import (
     by_sample,
     cut,
     fit_segments,
-    solve_step,
 )
 from greybox.model.output import OutputModel
 from greybox.model.run.output_runs import Filter, Observer
+from greybox.numerics.linalg import bounded_step
 
 Array = NDArray[np.float64]
 
@@ -137,7 +137,7 @@ def fit_noise(runs: FilterRuns, p: Array, nodes: Array) -> Array:
         # scoring: the expected second derivatives of the Gaussian likelihood
         information = by_level.T @ by_level / 2 + by_r.T @ by_r
         downhill = -((1 - r**2) @ by_level / 2 + r @ by_r)
-        step = solve_step(
+        step = bounded_step(
             information,
             downhill,
             np.maximum(low - logs, -_LARGEST),

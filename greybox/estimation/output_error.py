@@ -38,7 +38,6 @@ from greybox.estimation.innovations import FilterRuns, fit_innovations
 from greybox.estimation.output_setup import deviations, measured, output_model, turns
 from greybox.estimation.result import Estimate
 from greybox.estimation.shooting import (
-    RANK,
     TOLERANCE,
     FreeRuns,
     Linearised,
@@ -58,7 +57,7 @@ from greybox.model.output import OutputModel, Role
 from greybox.model.predictor import Predictor
 from greybox.model.run.output_runs import Simulator
 from greybox.model.run.step import Integrator
-from greybox.numerics.linalg import scaled, scaled_inverse
+from greybox.numerics.linalg import UNKNOWN, scaled, scaled_inverse
 from greybox.numerics.threads import one_thread
 from greybox.public import known_keywords
 from greybox.regression.regression import common_sample_time
@@ -722,7 +721,7 @@ def _require_known(model: OutputModel, hessian: Array, bound: NDArray[np.bool_])
         )
     unit, _ = scaled(hessian[np.ix_(free, free)])
     values, vectors = np.linalg.eigh((unit + unit.T) / 2)
-    if values[0] > RANK * values[-1]:
+    if values[0] > UNKNOWN * values[-1]:
         return
     size = np.abs(vectors[:, 0])
     involved = [names[i] for i in np.argsort(-size) if size[i] > 0.2]
@@ -731,8 +730,8 @@ def _require_known(model: OutputModel, hessian: Array, bound: NDArray[np.bool_])
             require_parameter(int(free[i]))
     raise ExcitationError(
         f"{', '.join(involved)} cannot be told apart by the free run (relative eigenvalue "
-        f"{max(values[0] / values[-1], 0):.1e}, needs {RANK:.0e}): excite them separately, leave "
-        f"one out, or give one a prior (--prior NAME=VALUE:STD)."
+        f"{max(values[0] / values[-1], 0):.1e}, needs {UNKNOWN:.0e}): excite them separately, "
+        f"leave one out, or give one a prior (--prior NAME=VALUE:STD)."
     )
 
 

@@ -23,13 +23,13 @@ from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 from scipy.sparse import block_diag, bmat, csc_matrix
 from scipy.sparse.linalg import splu
 
 from greybox.model.output import OutputModel
 from greybox.model.run.output_runs import Simulator
 from greybox.numerics.effort import require_time
+from greybox.numerics.linalg import bounded_step
 from greybox.numerics.robust import huber_loss, huber_weights
 
 Array = NDArray[np.float64]
@@ -40,8 +40,6 @@ TOLERANCE = 1e-6
 # starts and ends of segments meet within this many noise deviations
 _JOINED = 1e-6
 _MOST = 60
-# relative singular value of the scaled normal equations below which a direction is unknown
-RANK = 1e-10
 # a run this many times beyond the largest measured value has escaped
 _ESCAPED = 1e3
 _DAMPING_LIMIT = 1e8
@@ -339,50 +337,6 @@ def reduce_starts(at: Linearised, segments: Segments, nodes: Array, q: int, loss
     )
 
 
-def solve_step(
-    hessian: Array,
-    gradient: Array,
-    low: Array,
-    high: Array,
-    damping: float = 0.0,
-) -> Array:
-    """Minimise ½ δᵀHδ − gᵀδ within bounds, in the directions that are known.
-
-    Parameters
-    ----------
-    hessian : ndarray
-        (q, q) positive semidefinite.
-    gradient : ndarray
-        (q,)
-    low, high : ndarray
-        (q,) bounds on δ.
-    damping : float
-        Levenberg-Marquardt share added to the diagonal.
-    """
-    if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
-        # where squares overflow there is no step
-        return np.asarray(np.clip(0.0, low, high))
-    scale = np.sqrt(np.maximum(np.diag(hessian), 0.0))
-    scale[scale == 0] = 1.0
-    unit = hessian / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh((unit + unit.T) / 2)
-    values = np.where(values > RANK * values[-1], values, np.inf) + damping
-    root = vectors / np.sqrt(values)
-    step = (root @ (root.T @ (gradient / scale))) / scale
-    if (step >= low).all() and (step <= high).all():
-        return np.asarray(step)
-    known = np.isfinite(values)
-    factor = np.sqrt(values[known])[:, None] * vectors[:, known].T
-    target = (vectors[:, known].T @ (gradient / scale)) / np.sqrt(values[known])
-    # a direction that nothing determines stays where it is
-    factor = np.vstack([factor, 1e-6 * np.eye(len(gradient))])
-    target = np.concatenate([target, np.zeros(len(gradient))])
-    with np.errstate(over="ignore", invalid="ignore"):
-        solved = lsq_linear(factor, target, bounds=(low * scale, high * scale), method="bvls")
-    found = np.where(np.isfinite(solved.x), solved.x, 0.0)
-    return np.asarray(np.clip(found / scale, low, high))
-
-
 def _scales(runs: Runs, nz: int) -> Array:
     """Return the noise of each simulated state, (nz,), to weigh gaps with."""
     sigma = getattr(runs, "sigma", None)
@@ -451,7 +405,7 @@ def fit_segments(
         gradient = reduced.gradient - restrictions.precision * (p - restrictions.mean)
         accepted = False
         while damping < _DAMPING_LIMIT:
-            step = solve_step(
+            step = bounded_step(
                 hessian, gradient, restrictions.low - p, restrictions.high - p, damping
             )
             shift = reduced.starts - reduced.starts_by_p @ step

@@ -9,6 +9,8 @@ Array = NDArray[np.float64]
 
 # relative singular value of a scaled matrix below which a direction is rounding
 ROUNDING = 1e-15
+# relative eigenvalue of scaled normal equations below which a direction is not known
+UNKNOWN = 1e-10
 _TINY = 1e-300
 
 
@@ -37,6 +39,62 @@ def scaled_inverse(matrix: Array, least: float = ROUNDING) -> Array:
     """
     unit, outer = scaled(matrix)
     return np.asarray(np.linalg.pinv(unit, rcond=least) / outer)
+
+
+def bounded_step(
+    normal: Array,
+    gradient: Array,
+    low: Array,
+    high: Array,
+    damping: float = 0.0,
+    least: float = UNKNOWN,
+) -> Array:
+    """Minimise ½ δᵀNδ − gᵀδ within bounds, in the directions that are known.
+
+    Parameters
+    ----------
+    normal : ndarray
+        (q, q) positive semidefinite.
+    gradient : ndarray
+        (q,)
+    low, high : ndarray
+        (q,) bounds on δ.
+    damping : float
+        Levenberg-Marquardt share added to the diagonal.
+    least : float
+        Directions with less than this share of the largest eigenvalue are not known.
+
+    References
+    ----------
+    Stark and Parker (1995), bounded-variable least squares.
+    """
+    from scipy.optimize import lsq_linear
+
+    if not (np.isfinite(normal).all() and np.isfinite(gradient).all()):
+        # where squares overflow there is no step
+        return np.asarray(np.clip(0.0, low, high))
+    scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
+    scale[scale == 0] = 1.0
+    unit = normal / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh((unit + unit.T) / 2)
+    values = np.where(values > least * values[-1], values, np.inf) + damping
+    root = vectors / np.sqrt(values)
+    step = (root @ (root.T @ (gradient / scale))) / scale
+    if (step >= low).all() and (step <= high).all():
+        return np.asarray(step)
+    known = np.isfinite(values)
+    factor = np.sqrt(values[known])[:, None] * vectors[:, known].T
+    target = (vectors[:, known].T @ (gradient / scale)) / np.sqrt(values[known])
+    # a direction that nothing determines stays where it is
+    factor = np.vstack([factor, 1e-6 * np.eye(len(gradient))])
+    target = np.concatenate([target, np.zeros(len(gradient))])
+    free = low < high
+    found = np.where(free, 0.0, low * scale)
+    limits = (low[free] * scale[free], high[free] * scale[free])
+    with np.errstate(over="ignore", invalid="ignore"):
+        target = target - factor[:, ~free] @ found[~free]
+        found[free] = lsq_linear(factor[:, free], target, limits, method="bvls").x
+    return np.asarray(np.clip(np.where(np.isfinite(found), found, 0.0) / scale, low, high))
 
 
 def scaled_root(covariance: Array) -> Array:

@@ -27,17 +27,15 @@ from greybox.estimation.free_run import changes
 from greybox.estimation.innovations import ObservedRuns
 from greybox.estimation.output_setup import deviations, measured, output_model, output_predictor
 from greybox.estimation.shooting import (
-    RANK,
     FreeRuns,
     cut,
     measured_starts,
-    solve_step,
 )
 from greybox.model.disturbances import turn_bounds
 from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.numerics.effort import require_time, seconds_left
-from greybox.numerics.linalg import scaled_inverse
+from greybox.numerics.linalg import UNKNOWN, bounded_step, scaled_inverse
 from greybox.regression.regression import common_sample_time
 from greybox.trial.log import TrialLog
 
@@ -83,7 +81,7 @@ class _Point:
         step = np.zeros_like(self.p)
         low, high = (bound[active] - self.p[active] for bound in self.bounds)
         part = np.ix_(active, active)
-        step[active] = solve_step(
+        step[active] = bounded_step(
             hessian[part], gradient[active], np.minimum(low, 0.0), np.maximum(high, 0.0)
         )
         return step
@@ -391,7 +389,7 @@ class FreeRunSelection:
         index = np.array(active)
         at = self._widened(runs, at)
         hessian, gradient = at.hessian, at.gradient
-        inverse = scaled_inverse(hessian[np.ix_(index, index)], RANK)
+        inverse = scaled_inverse(hessian[np.ix_(index, index)], UNKNOWN)
         out = np.setdiff1d(np.arange(len(at.p)), index)
         cross = hessian[np.ix_(out, index)]
         own = np.diag(hessian)[out]
@@ -423,7 +421,7 @@ class FreeRunSelection:
         """Return the term that earns least and the fit without it, None where all earn enough."""
         index = np.array(active)
         hessian, gradient = at.hessian, at.gradient
-        variance = np.diag(scaled_inverse(hessian[np.ix_(index, index)], RANK))
+        variance = np.diag(scaled_inverse(hessian[np.ix_(index, index)], UNKNOWN))
         # what moves nothing earns nothing
         loss = np.divide(
             0.5 * at.p[index] ** 2, variance, out=np.zeros(len(index)), where=variance > 0

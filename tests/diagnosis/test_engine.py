@@ -14,7 +14,6 @@ from greybox.diagnosis.fitting import Problem
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.linear import NOWHERE, Slopes, sensitivities
 from greybox.diagnosis.noise import Likelihood, Noise, NoiseModel, fit_noise
-from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.null_model import _as_it_should_be
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.scores import ProjectedScores
@@ -346,24 +345,6 @@ def test_fit_equals_least_squares(log: TrialLog) -> None:
     other = least_squares(residual, point.vector() / scale, x_scale="jac")
     assert fit.converged
     assert (fit.nu[0] ** 2).sum() == pytest.approx(2 * other.cost, rel=1e-5)
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_bounded_step_is_the_best_within_its_bounds(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    # alike columns: where one stops, others go back
-    rows = rng.standard_normal((30, 6)) @ (np.eye(6) + 3 * rng.standard_normal((6, 1)))
-    target = rows @ rng.standard_normal(6) + rng.standard_normal(30)
-    low, high = np.full(6, -0.05), np.full(6, 0.1)
-    low[2] = high[2] = 0.02
-    found = bounded_step(rows.T @ rows, rows.T @ target, low, high, 0.0)
-    assert (found >= low).all()
-    assert (found <= high).all()
-    # Karush, Kuhn and Tucker: no number gains by a move that its bounds allow
-    slope = rows.T @ (target - rows @ found)
-    size = np.linalg.norm(rows, axis=0) * np.linalg.norm(target)
-    assert (np.where(found < high - 1e-12, slope, 0.0) < 1e-8 * size).all()
-    assert (np.where(found > low + 1e-12, slope, 0.0) > -1e-8 * size).all()
 
 
 def test_adding_and_dropping_an_atom_changes_nothing_else(log: TrialLog) -> None:

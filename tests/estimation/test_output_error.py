@@ -27,7 +27,6 @@ from greybox.estimation.shooting import (
     Measured,
     cut,
     measured_starts,
-    solve_step,
     unrestricted,
 )
 from greybox.model.catalogue import get_structure
@@ -596,28 +595,6 @@ class TestRestrictions:
     def test_wrong_ones_are_refused(self, predictor, noisy, options, words):
         with pytest.raises(UsageError, match=words.split(",")[0].split(".")[0]):
             estimate_oe(predictor, [noisy], options=OutputErrorOptions(**options))
-
-    def test_a_step_within_bounds_is_the_best_one(self):
-        rng = np.random.default_rng(0)
-        root = rng.standard_normal((6, 4))
-        hessian, gradient = root.T @ root, rng.standard_normal(4)
-        low, high = np.full(4, -0.1), np.full(4, 0.2)
-        step = solve_step(hessian, gradient, low, high)
-        assert (step >= low - 1e-12).all()
-        assert (step <= high + 1e-12).all()
-        slope = hessian @ step - gradient
-        assert (np.abs(slope[(step > low) & (step < high)]) < 1e-5).all()
-
-
-@pytest.mark.parametrize("size", [np.nan, np.inf, 1e200])
-def test_where_squares_overflow_there_is_no_step(size):
-    low, high = np.array([-1.0, 0.5]), np.array([1.0, 2.0])
-    for hessian, gradient in (
-        (np.diag([1.0, size]), np.ones(2)),
-        (np.eye(2), np.array([1.0, size])),
-    ):
-        step = solve_step(hessian, gradient, low, high)
-        assert ((low <= step) & (step <= high)).all()
 
 
 class TestRefusals:

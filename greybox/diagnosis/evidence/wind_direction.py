@@ -22,11 +22,11 @@ from greybox.diagnosis.evidence.held_out import HeldOut, OtherLogs
 from greybox.diagnosis.evidence.remainder import MOTION_AND_COMMANDS, Takings, rival
 from greybox.diagnosis.fitting import Problem, measured
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
-from greybox.diagnosis.normal import bounded_step
 from greybox.diagnosis.point import Fit
 from greybox.diagnosis.ship import LogRun
 from greybox.model.disturbances import WIND_TERMS
 from greybox.model.terms import parse_term
+from greybox.numerics.linalg import bounded_step
 from greybox.trial.segments import of_one_log
 
 Array = NDArray[np.float64]
