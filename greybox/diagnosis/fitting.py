@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.linear import NOWHERE
 from greybox.diagnosis.noise import Noise, fit_noise, free_run_noise
-from greybox.diagnosis.normal import inverses
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.ship import CURRENTS, LogRun, Ship
 from greybox.diagnosis.thresholds import DECIDED
 from greybox.model.run.step import MONOTONE
 from greybox.numerics.lagged_moments import automatic_lags, bartlett_sums
-from greybox.numerics.linalg import bounded_step
+from greybox.numerics.linalg import bounded_step, known_and_unknown_inverse
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -29,6 +28,8 @@ Metric = Literal["coloured", "free run"]
 # a step that promises less than this of −2 log L ends the search
 _ENOUGH = 0.02
 MOST = 25
+# share of the largest eigenvalue below which a covariance tells nothing of a direction
+_UNKNOWN = 1e-9
 # a point that −2 log L tells from another by less than this has its derivatives
 _NEAR = 1.0
 # a fall of −2 log L that differs from what its step promised by less than this share shows that
@@ -510,7 +511,7 @@ class Problem:
         lags = max(round(samples ** (1 / 3)), automatic_lags(nu))
         middle = bartlett_sums(scores, lags)
         # of columns that are alike only the sum is known, and scores tell nothing of the rest
-        spread, unknown = inverses(normal)
+        spread, unknown = known_and_unknown_inverse(normal, _UNKNOWN)
         robust = spread @ middle @ spread * samples / max(samples - q, 1)
         # rounding may leave nothing of a variance beside numbers that are hardly known
         lost = np.diag(robust) <= 0

@@ -73,10 +73,7 @@ def bounded_step(
     if not (np.isfinite(normal).all() and np.isfinite(gradient).all()):
         # where squares overflow there is no step
         return np.asarray(np.clip(0.0, low, high))
-    scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
-    scale[scale == 0] = 1.0
-    unit = normal / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh((unit + unit.T) / 2)
+    scale, values, vectors = _directions(normal)
     values = np.where(values > least * values[-1], values, np.inf) + damping
     root = vectors / np.sqrt(values)
     step = (root @ (root.T @ (gradient / scale))) / scale
@@ -95,6 +92,38 @@ def bounded_step(
         target = target - factor[:, ~free] @ found[~free]
         found[free] = lsq_linear(factor[:, free], target, limits, method="bvls").x
     return np.asarray(np.clip(np.where(np.isfinite(found), found, 0.0) / scale, low, high))
+
+
+def known_and_unknown_inverse(normal: Array, least: float) -> tuple[Array, Array]:
+    """Return the inverse (q, q) in two parts that add up: of what is known, and of what is not.
+
+    What nothing determines gets a spread beyond every other.
+
+    Parameters
+    ----------
+    normal : ndarray
+        (q, q) positive semidefinite.
+    least : float
+        Directions with less than this share of the largest eigenvalue are not known.
+    """
+    scale, values, vectors = _directions(normal)
+    floor = least * max(values[-1], _TINY)
+    known = values > floor
+    one, two = (
+        (vectors[:, mine] / np.maximum(values[mine], floor)) @ vectors[:, mine].T
+        for mine in (known, ~known)
+    )
+    outer = np.outer(scale, scale)
+    return one / outer, two / outer
+
+
+def _directions(normal: Array) -> tuple[Array, Array, Array]:
+    """Return scales (q,), and eigenvalues and eigenvectors of a matrix in these scales."""
+    scale = np.sqrt(np.maximum(np.diag(normal), 0.0))
+    scale[scale == 0] = 1.0
+    unit = normal / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh((unit + unit.T) / 2)
+    return scale, values, vectors
 
 
 def scaled_root(covariance: Array) -> Array:

@@ -5,7 +5,12 @@ import pytest
 
 from greybox.numerics.banded import factor_band, inverse_band
 from greybox.numerics.lagged_moments import convolve, lagged_products, lagged_sums
-from greybox.numerics.linalg import scaled_inverse, scaled_logdet, scaled_root
+from greybox.numerics.linalg import (
+    known_and_unknown_inverse,
+    scaled_inverse,
+    scaled_logdet,
+    scaled_root,
+)
 
 
 def test_lagged_sums_are_the_diagonal_of_lagged_products():
@@ -61,3 +66,14 @@ def test_the_band_of_an_inverse_equals_the_dense_inverse(size, rows):
             found[d, : rows - d][inside], np.diag(inverse, -d)[inside], rtol=1e-9, atol=1e-15
         )
     assert factor_band(-band) is None
+
+
+def test_what_nothing_determines_has_a_spread_beyond_every_other():
+    rows = np.random.default_rng(4).standard_normal((20, 3)) * [1.0, 1e3, 1e-3]
+    rows[:, 2] = 1e-6 * rows[:, 1]
+    known, unknown = known_and_unknown_inverse(rows.T @ rows, 1e-9)
+    assert known[0, 0] == pytest.approx(np.linalg.inv(rows[:, :2].T @ rows[:, :2])[0, 0], rel=1e-6)
+    assert unknown[1, 1] > 1e6 * known[1, 1] > 0
+    whole, none = known_and_unknown_inverse(rows[:, :2].T @ rows[:, :2], 1e-9)
+    np.testing.assert_allclose(whole, np.linalg.inv(rows[:, :2].T @ rows[:, :2]), rtol=1e-9)
+    assert (none == 0).all()
