@@ -4,13 +4,14 @@ Ships of `tests/foreign_ships` sail a first trial of random steps, `greybox esti
 prior, and a second trial of each kind is sailed and estimated with defaults, as a user does:
 
     PYTHONPATH=tests python -m benchmarks.foreign_designs --out DIR [--ships ...] [--seeds ...]
-        [--arms ...]
+        [--arms ...] [--prior none]
 
 Trials last sixty lengths, 5 to 15 min. `random` holds settings for half a length to two lengths,
 `zigzag` goes to both sides at three speeds, `plan` is `greybox design`; `long-` is half as long
 again. `whole` is one plan of 15 min, `stages` three of 5 min, the later ones made by `--after` of
-those before. What stands in DIR is not made again. Errors are those of free runs over one long
-trial of the operating envelope: random steps, zig-zags and turns, to both sides at all speeds.
+those before. With `--prior none` there is no first trial: plans begin with main dimensions. What
+stands in DIR is not made again. Errors are those of free runs over one long trial of the operating
+envelope: random steps, zig-zags and turns, to both sides at all speeds.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from benchmarks.foreign_causes import SAMPLE_TIMES
+from greybox.vessel.toml import load_vessel
 
 Array = NDArray[np.float64]
 
@@ -114,7 +116,9 @@ def _every(name: str) -> int:
 
 
 def _prior(folder: Path, name: str, seed: int, duration: float) -> tuple[object, ...]:
-    """Return how a plan of some duration is made from the model of the first trial."""
+    """Return how a plan of some duration is made before its trial."""
+    if load_vessel(folder / "vessel.toml").beam is not None:
+        return ("--prior", "none", "--duration", duration)
     fit(folder, name, "first", seed)
     return ("--model", folder / "first.json", "--duration", duration)
 
@@ -154,13 +158,25 @@ def fit(folder: Path, name: str, arm: str, seed: int) -> list[float]:
     return [float(f) for f in json.loads(told.read_text())]
 
 
-def case(place: Path, name: str, seed: int, arms: Sequence[str]) -> dict[str, list[float]]:
-    """Return the fits of each kind of trial of one ship."""
+def vessel_file(name: str, *, dimensions: bool) -> str:
+    """Return the vessel file of a ship, with its main dimensions where they are the prior."""
+    ship = presets()[name].ship
+    if not dimensions:
+        return str(ship.vessel_toml())
+    known = {"beam": ship.beam, "mass": ship.inertia[0], "service_speed": ship.service_speed}
+    first = [f"{k} = {v:g}" for k, v in known.items()]
+    return "\n".join([*first, ship.vessel_toml(), "[conditions]", f"draught = {ship.draught:g}\n"])
+
+
+def case(
+    place: Path, name: str, seed: int, arms: Sequence[str], *, dimensions: bool = False
+) -> dict[str, list[float]]:
+    """Return the fits of each kind of trial of one ship; `dimensions` are the prior of plans."""
     folder = place / f"{name}-{seed}"
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "vessel.toml").write_text(presets()[name].ship.vessel_toml())
+    (folder / "vessel.toml").write_text(vessel_file(name, dimensions=dimensions))
     found: dict[str, list[float]] = {}
-    for arm in ("first", *arms):
+    for arm in (*(() if dimensions else ("first",)), *arms):
         try:
             found[arm] = fit(folder, name, arm, seed)
         except subprocess.CalledProcessError as error:
@@ -181,14 +197,14 @@ def paired(logs: Array) -> str:
     return f"{middle:.2f} ({low:.2f} to {high:.2f}) n={n}"
 
 
-def row(name: str, cases: Sequence[dict[str, list[float]]]) -> str:
-    """Return mean fits, and the errors of each other kind of trial over those of the plan."""
+def row(name: str, cases: Sequence[dict[str, list[float]]], base: str) -> str:
+    """Return mean fits, and the errors of each other kind of trial over those of `base`."""
     fits = {arm: np.array([c[arm] for c in cases]) for arm in cases[0]}
     means = "".join(f"{np.nanmean(f):>12.1f}" for f in fits.values())
     # geometric mean over the states of the rms error in the deviation of each
     errors = {arm: np.log(np.maximum(1 - f / 100, 1e-6)).mean(axis=1) for arm, f in fits.items()}
-    others = [arm for arm in errors if arm not in ("first", "plan")] if "plan" in errors else []
-    told = "".join(f"   {paired(errors[arm] - errors['plan']):<24}" for arm in others)
+    others = [arm for arm in errors if arm not in ("first", base)] if base else []
+    told = "".join(f"   {paired(errors[arm] - errors[base]):<24}" for arm in others)
     return f"{name:<24}{means}{told}".rstrip()
 
 
@@ -198,20 +214,23 @@ def main() -> None:
     parser.add_argument("--ships", nargs="+", default=list(SHIPS), choices=sorted(presets()))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4])
     parser.add_argument("--arms", nargs="+", default=list(ARMS[:5]), choices=ARMS)
+    parser.add_argument("--prior", choices=("first", "none"), default="first")
     options = parser.parse_args()
+    dimensions = options.prior == "none"
     found: dict[str, list[dict[str, list[float]]]] = {name: [] for name in options.ships}
     for seed in options.seeds:
         for name in options.ships:
-            found[name].append(case(options.out, name, seed, options.arms))
+            found[name].append(case(options.out, name, seed, options.arms, dimensions=dimensions))
             told = {arm: round(float(np.mean(v)), 1) for arm, v in found[name][-1].items()}
             print(f"{name} {seed}: {told}", flush=True)
-    others = [arm for arm in options.arms if arm != "plan"] if "plan" in options.arms else []
-    print(f"{'mean held-out fit [%]':<24}"
-          + "".join(f"{arm:>12}" for arm in ("first", *options.arms))
-          + "".join(f"   {f'{arm} over plan':<24}" for arm in others) + "   (errors)")  # fmt: skip
+    base = next((arm for arm in ("plan", "stages") if arm in options.arms), "")
+    sailed = [*(() if dimensions else ("first",)), *options.arms]
+    others = [arm for arm in options.arms if arm != base] if base else []
+    print(f"{'mean held-out fit [%]':<24}" + "".join(f"{arm:>12}" for arm in sailed)
+          + "".join(f"   {f'{x} over {base}':<24}" for x in others) + "   (errors)")  # fmt: skip
     for name, cases in found.items():
-        print(row(name, cases))
-    print(row("all", [c for cases in found.values() for c in cases]))
+        print(row(name, cases, base))
+    print(row("all", [c for cases in found.values() for c in cases], base))
 
 
 if __name__ == "__main__":

@@ -246,10 +246,13 @@ class FreeRunSelection:
             for log, run, used in zip(self._whole.y, y, self._whole.use, strict=True)
         ]
 
-    def escapes(self, p: Array, bound: Array) -> bool:
-        """Whether a free run on one of the logs leaves a bound (nx,) of its states."""
+    def escapes(self, p: Array, bounds: tuple[Array, Array]) -> bool:
+        """Whether a free run on one of the logs leaves its least or greatest states, (nx,) each."""
+        least, most = bounds
         runs = self.runs.outputs(p, self.starts)
-        return not all((np.abs(y[:, : len(bound)]) <= bound).all() for y in runs)
+        return not all(
+            ((y[:, : len(most)] >= least) & (y[:, : len(most)] <= most)).all() for y in runs
+        )
 
     def _begun(self, active: list[int], most: int, earns: float) -> tuple[list[int], Array]:
         """Return terms, and parameters near those of a free run."""

@@ -24,14 +24,13 @@ from greybox.model.run.step import Integrator
 from greybox.model.structure import Structure
 from greybox.numerics.effort import Shares, seconds_left, within
 from greybox.numerics.parallel import Piece, Result, lanes, map_forked
-from greybox.regression.instruments import state_bound
 from greybox.selection.cross_validation import Refit, parts_of
 from greybox.selection.family import family_for, first_terms, spell_structure
 from greybox.selection.free_run_selection import FreeRunSelection, Selected
 from greybox.selection.held_out import extent, folds, rank, spread_of
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
-from greybox.validation.held_commands import held_commands
+from greybox.validation.held_commands import held_bounds, held_commands
 from greybox.vessel.force import force_inputs
 from greybox.vessel.thrust import ThrustLaw, typical_speed
 from greybox.vessel.vessel import Between
@@ -483,13 +482,13 @@ def _staying(
     if not chosen or not held:
         return chosen, 0
     runs = FreeRunSelection(held, structure, kind)
-    bound = state_bound(held[0], structure.states)
+    bounds = held_bounds(logs, structure.states)
     left: list[Array | None] = [*scores]
     now = chosen
     while now:
         found = sets[now - 1]
         assert found is not None
-        if not runs.escapes(found.p, bound):
+        if not runs.escapes(found.p, bounds):
             return now, len(left) - sum(s is not None for s in left)
         left[now] = None
         now = rank(left, preferred, given_away=_GIVEN_AWAY).chosen

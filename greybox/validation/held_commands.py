@@ -1,7 +1,8 @@
 """Whether a model stays bounded where commands are held as they once were in the logs.
 
 A regression may follow its own logs and those left out, and run away in the first long turn:
-what it lacks is damping where the logs never stayed. Held commands ask for no measurement.
+what it lacks is damping where the logs never stayed. Or it slows down in turns until it goes
+astern, against thrust ahead. Held commands ask for no measurement.
 """
 
 from __future__ import annotations
@@ -14,11 +15,16 @@ from numpy.typing import NDArray
 
 from greybox.estimation.prediction_verdict import LIMITS, HeldCommandsDiverge, SomeHeldDiverge
 from greybox.model.model import ManoeuvringModel
+from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
 
+Array = NDArray[np.float64]
+
 # settings that are held
 _SETTINGS = 16
+# of the greatest speed ahead: no ship that only pushes ahead goes astern faster than a current
+_ASTERN = 0.5
 
 
 def held_commands_diverge(
@@ -41,18 +47,42 @@ def held_commands_diverge(
         None where all runs stay bounded; `SomeHeldDiverge` where few do not.
     """
     settings = held_commands(logs)
+    least, most = held_bounds(logs, model.structure.states)
     left: list[tuple[float, dict[str, float]]] = []
     for log in settings:
-        run = run_model(model, log)
-        if run.diverged >= 0:
+        x = run_model(model, log).x
+        outside = ~((x >= least) & (x <= most)).all(axis=1)
+        if outside.any():
             held = {n: float(log[n][0]) for n in log.vessel.commands if n in log}
-            left.append((float(log.t[run.diverged] - log.t[0]), held))
+            left.append((float(log.t[outside.argmax()] - log.t[0]), held))
     if not left:
         return None
     after, commands = min(left, key=lambda found: found[0])
     many = len(left) > LIMITS.held * len(settings)
     told = HeldCommandsDiverge if many else SomeHeldDiverge
     return told(commands, after, len(left), len(settings))
+
+
+def held_bounds(logs: Sequence[TrialLog], states: Sequence[str]) -> tuple[Array, Array]:
+    """Return the least and the greatest states (nx,) of runs with commands held.
+
+    Of ships that never pushed or went astern in the logs the least surge is half of their greatest
+    speed, astern.
+
+    Parameters
+    ----------
+    logs : sequence of TrialLog
+    states : sequence of str
+    """
+    most = state_bound(max(logs, key=len), tuple(states))
+    least = -most
+    if "u" in states:
+        seen = [log["u"][log.known(["u"])] for log in logs]
+        slowest = -_ASTERN * max(u.max(initial=0.0) for u in seen)
+        pushes = min(log.forces(("taux",)).min(initial=0.0) for log in logs)
+        if pushes >= 0 and min(u.min(initial=0.0) for u in seen) > slowest:
+            least[list(states).index("u")] = slowest
+    return least, most
 
 
 def held_commands(logs: Sequence[TrialLog]) -> list[TrialLog]:

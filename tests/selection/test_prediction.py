@@ -18,7 +18,7 @@ from greybox.selection.estimate import estimate_model
 from greybox.selection.prediction import refit_alike, with_prediction
 from greybox.selection.request import Request
 from greybox.trial.steps import Step
-from greybox.validation.held_commands import held_commands_diverge
+from greybox.validation.held_commands import held_bounds, held_commands_diverge
 
 ASKED = {"structure": "thesis", "predictor": "basic"}
 CALM = {"wind": 0.0, "spread": 1e-12, "current": (0.0, 0.0)}
@@ -269,3 +269,18 @@ def test_a_model_that_runs_away_where_commands_are_held_is_poor(estimate, logs):
     judged = weigh_prediction(estimate.prediction.channels, JudgedOn.HELD_OUT, found=[found])
     assert judged.level is PredictionLevel.POOR
     assert judged.text == f"poor: {found.sentence}"
+
+
+def test_a_model_that_goes_astern_under_thrust_ahead_is_poor(estimate, logs):
+    """Within the bound of free runs, but where a ship that only pushed ahead cannot be."""
+    model = estimate.model()
+    reversed_thrust = np.where(np.array(model.names) == "Xmu", -1.0, 1.0) * model.theta
+    least, most = held_bounds(logs, model.structure.states)
+    fastest = max(log["u"].max() for log in logs)
+    np.testing.assert_allclose(least, [-0.5 * fastest, *-most[1:]])
+    found = held_commands_diverge(replace(model, theta=reversed_thrust), logs)
+    assert found is not None
+    assert found.count > found.settings / 2
+    # of a ship that did push astern nothing is known
+    astern = replace(logs[0], channels={**logs[0].channels, "n": -logs[0]["n"]})
+    np.testing.assert_array_equal(held_bounds([*logs, astern], model.structure.states)[0], -most)
