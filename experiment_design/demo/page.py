@@ -15,13 +15,16 @@ from greybox.report.chart import chart_of
 from greybox.report.comparison import comparison_page
 from greybox.report.diagnosed_causes import cause_section
 from greybox.report.diagnosis import diagnosis_page, gain_picture, gain_section
-from greybox.report.error_budget import noise_sentence
-from greybox.report.figures import to_svg
+from greybox.report.error_budget import noise_bounds, noise_sentence, noise_shares
+from greybox.report.figures import to_svg, told_fits
 from greybox.report.log import page_figures
 from greybox.report.model_difference import marked_equations
 from greybox.report.next_steps import NextStep
 from greybox.report.page import Marked, Page, Picture, Section, Table, flatten
 from greybox.validation.comparison import Comparison
+
+# share of the squared error from which on noise is all that is left
+_NOISE = 0.9
 
 
 def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
@@ -47,7 +50,11 @@ def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
     wrong = diagnosis_page(diagnosis, {}).sections[0]
     extended = gain_section(diagnosis).pictures
     gain, *after = [
-        *([gain_picture(demo.gain, " on the other log")] if extended else []),
+        *(
+            [gain_picture(demo.gain, " on the other log", bounds=noise_bounds(diagnosis))]
+            if extended
+            else []
+        ),
         *_runs(demo.after, model, diagnosis.model),
     ]
     shown: list[tuple[Sequence[Picture], Sequence[Table], Sequence[Marked], Sequence[str]]] = [
@@ -72,7 +79,7 @@ def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
     budget = diagnosis.budget
     return Page(
         title="The whole loop on a virtual ship",
-        headline=headline(diagnosis, demo),
+        headline=f"{headline(diagnosis, demo)}{_only_noise(diagnosis)}",
         sentences=[
             "Each step below shows the command that does it; the files that it reads and writes "
             "stand beside this page, so that every step can be taken again by hand.",
@@ -105,6 +112,18 @@ def headline(diagnosis: Diagnosis, demo: Demo) -> str:
     return f"{asked}; the verdict of these logs is '{diagnosis.verdict}'" + (
         f", with {', '.join(named)} named." if named else "."
     )
+
+
+def _only_noise(diagnosis: Diagnosis) -> str:
+    """Return that the sensors, not the model, make the error that is left, where they do."""
+    shares, bounds = noise_shares(diagnosis), noise_bounds(diagnosis)
+    if not shares or min(shares.values()) < _NOISE:
+        return ""
+    least, most = (f"{100 * f(shares.values()):.0f}" for f in (min, max))
+    told = f" What error is left is sensor noise ({least}{f' to {most}' * (most != least)} % of it)"
+    if bounds:
+        told += f": a perfect model would fit no better than {told_fits(bounds, 0)}"
+    return f"{told}."
 
 
 def _section(

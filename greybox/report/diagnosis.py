@@ -10,6 +10,7 @@ from typing import Any
 
 from greybox.channels import CHANNELS, MOTION_WORDS
 from greybox.diagnosis.result import Diagnosis, Gain, Runs, hardly_split, is_split
+from greybox.estimation.prediction_verdict import LIMITS
 from greybox.report.chart import chart_of
 from greybox.report.diagnosed_causes import cause_section, probability
 from greybox.report.diagnosis_figures import (
@@ -28,9 +29,11 @@ from greybox.report.error_budget import (
     budget_table,
     cut_off,
     largest,
+    noise_bounds,
     noise_sentence,
+    tells,
 )
-from greybox.report.figures import narrow, percent
+from greybox.report.figures import narrow, percent, told_fits
 from greybox.report.free_run_errors import REGIMES, Errors, gather, simulations
 from greybox.report.model_difference import (
     coefficient_table,
@@ -45,6 +48,10 @@ from greybox.report.thinning import points_for
 _MOST_LOGS = 3
 # characters of a verdict that leave room for the next step on the first screen
 _LONGEST = 330
+# fit [%] with which the error is half of the spread: the limit of a good prediction
+_USABLE = 100 * (1 - LIMITS.good)
+# percent of fit below what noise allows that are as good as it
+_NEAR = 5.0
 
 
 def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
@@ -58,9 +65,12 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
     """
     wrong, gain = _wrong(diagnosis), gain_section(diagnosis)
     # whose the error is says most; without it, what was gained; without that, the run itself
-    lead = next(iter([*_budget(diagnosis), *gain.pictures, *wrong.pictures[:1]]), None)
+    budget = list(_budget(diagnosis))
+    first = [*gain.pictures, *wrong.pictures[:1]]
+    # a picture of shares that the logs do not tell is empty
+    lead = next(iter([*budget, *first] if tells(diagnosis.budget) else [*first, *budget]), None)
     sections = [
-        replace(wrong, pictures=[p for p in wrong.pictures if p is not lead]),
+        replace(wrong, pictures=[p for p in [*wrong.pictures, *budget] if p is not lead]),
         cause_section(diagnosis),
         _equations(diagnosis),
         replace(gain, pictures=[p for p in gain.pictures if p is not lead]),
@@ -68,7 +78,7 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
     ]
     if diagnosis.notes:
         sections.append(Section("Notes", points=diagnosis.notes))
-    headline = _headline(diagnosis)
+    headline = " ".join(filter(None, [_headline(diagnosis), _use(diagnosis)]))
     return Page(
         title="What the simulation gets wrong, and why",
         headline=capital(headline),
@@ -100,6 +110,23 @@ def _headline(diagnosis: Diagnosis) -> str:
     )
     rest = " They do not explain all of it." if diagnosis.verdict == "partly" else ""
     return f"{len(diagnosis.causes)} causes stand: {titles}.{rest}"
+
+
+def _use(diagnosis: Diagnosis) -> str:
+    """Return whether the model predicts what it was not fitted to, beside what noise allows."""
+    after = {s: g.after for s, g in diagnosis.gain.items()}
+    if not after:
+        return ""
+    bounds = {s: b for s, b in noise_bounds(diagnosis).items() if s in after}
+    # noise may hide a channel, which is no fault of the model
+    weak = [s for s, fit in after.items() if fit < min(_USABLE, bounds.get(s, 100.0) - _NEAR)]
+    which = "the extended model" if _changed(diagnosis) else "the model"
+    words = ", ".join(MOTION_WORDS.get(s, s) for s in weak)
+    told = f"Do not predict {words} with {which}" if weak else f"You can predict with {which}"
+    told += f": on data held out from the fit it has a fit of {told_fits(after, 0)}"
+    if bounds:
+        told += f"; sensor noise allows at most {told_fits(bounds, 0)}"
+    return f"{told}."
 
 
 def _step(told: str) -> NextStep:
@@ -297,20 +324,25 @@ def gain_section(diagnosis: Diagnosis) -> Section:
     on = diagnosis.validated_on
     return Section(
         "4. The gain", [capital(on).rstrip(".") + "."] if on else [],
-        [gain_picture(diagnosis.gain)] if _changed(diagnosis) else [], tables,
+        [gain_picture(diagnosis.gain, bounds=noise_bounds(diagnosis))]
+        if _changed(diagnosis) else [], tables,
     )  # fmt: skip
 
 
-def gain_picture(gain: Mapping[str, Gain], where: str = "") -> Picture:
-    """Return fits before and after, with the intervals of their gains."""
+def gain_picture(
+    gain: Mapping[str, Gain], where: str = "", *, bounds: Mapping[str, float] | None = None
+) -> Picture:
+    """Return fits before and after, with the intervals of their gains and what noise allows."""
     caption = f"Fit of the free run before and after{where}, with the 95 % interval of the gain."
     if any(min(g.before, g.after) < LOWEST_FIT for g in gain.values()):
         caption += f" Below {LOWEST_FIT:.0f} % it is drawn at the edge."
     if any(percent(g.before) == "diverged" for g in gain.values()):
         caption += " A run that diverged has no interval."
+    if bounds:
+        caption += " A bar marks the fit that a perfect model would have, for the sensors' noise."
     rows = _gain_table("", gain, ("before", "after")).rows
     told = "; ".join(f"{r[0]} {r[1]} to {r[2]}" for r in rows)
-    return narrow(gain_figure(gain), "gain", caption, f"{caption} {told}.")
+    return narrow(gain_figure(gain, bounds), "gain", caption, f"{caption} {told}.")
 
 
 def _gain_table(caption: str, gain: Mapping[str, Gain], heads: tuple[str, str]) -> Table:

@@ -185,7 +185,7 @@ def _legend(figure: Figure, ax: Any, *, enough: int = 1) -> None:
     """Put the legend above everything, where there are enough entries to need one."""
     if len(ax.get_legend_handles_labels()[1]) >= enough:
         look = {"fontsize": 8.5, "handlelength": 1.6, "columnspacing": 1.2}
-        legend_outside(figure, ax, "upper left", 3, **look)
+        legend_outside(figure, ax, "upper left", 4, **look)
 
 
 def regime_figure(errors: Errors) -> Figure:
@@ -224,10 +224,24 @@ def regime_figure(errors: Errors) -> Figure:
     return figure
 
 
-def gain_figure(gain: Mapping[str, Gain]) -> Figure:
-    """Draw the fit of each state before and after, the interval of the gain on the latter."""
+def gain_figure(gain: Mapping[str, Gain], bounds: Mapping[str, float] | None = None) -> Figure:
+    """Draw the fit of each state before and after, the interval of the gain on the latter.
+
+    Parameters
+    ----------
+    gain : mapping of str to Gain
+    bounds : mapping of str to float, optional
+        What a perfect model would reach by state [%], measured with the noise of the sensors.
+    """
     figure = new_figure(_WIDTH, 0.55 * len(gain) + 1.2)
     ax = figure.subplots()
+    bounded = [i for i, state in enumerate(gain) if state in (bounds or {})]
+    if bounds and bounded:
+        highest = [bounds[s] for s in gain if s in bounds]
+        ax.plot(
+            highest, bounded, "|", color=BLACK, markersize=15, markeredgewidth=2, zorder=4,
+            label="noise allows",
+        )  # fmt: skip
     for i, g in enumerate(gain.values()):
         before, after = max(g.before, LOWEST_FIT), max(g.after, LOWEST_FIT)
         ax.plot([before, after], [i, i], color="0.6", linewidth=1.5, zorder=1)

@@ -9,10 +9,17 @@ from textwrap import fill
 import numpy as np
 from matplotlib.figure import Figure
 
-from greybox.channels import MOTION_WORDS
 from greybox.diagnosis.budget import SENSOR
 from greybox.diagnosis.result import BudgetPart, Diagnosis, is_split, told_share
-from greybox.report.figures import BLUE, LABELS, ORANGE, legend_outside, new_figure, tidy
+from greybox.report.figures import (
+    BLUE,
+    LABELS,
+    ORANGE,
+    legend_outside,
+    new_figure,
+    tidy,
+    told_fits,
+)
 from greybox.report.page import Table
 from greybox.validation.fit import fit_percent
 
@@ -22,6 +29,8 @@ _WIDTH = 4.4
 _LETTERS = 22
 # shares in percent that are drawn; what lies beyond is cut off
 _SHOWN = (-60.0, 140.0)
+# share of the error of each state that a picture of its sources has to show
+_TELLING = 0.5
 
 
 def budget_in_words(diagnosis: Diagnosis) -> list[BudgetPart]:
@@ -94,26 +103,53 @@ def largest(budget: Sequence[BudgetPart]) -> str:
     return "; ".join(told)
 
 
+def tells(budget: Sequence[BudgetPart]) -> bool:
+    """Whether the parts that the logs tell make up half of the error of every state, or more."""
+    return bool(budget) and all(
+        sum(max(p.share[s], 0.0) for p in budget if is_split(p, s)) >= _TELLING
+        for s in budget[0].share
+    )
+
+
+def noise_shares(diagnosis: Diagnosis) -> dict[str, float]:
+    """Return the share that sensor noise has in the squared error that is left, by state."""
+    budget = diagnosis.budget
+    noise = next((p.after for p in budget if p.part == SENSOR), {})
+    return {
+        state: min(max(own / max(sum(p.after[state] for p in budget), 1e-300), 0.0), 1.0)
+        for state, own in noise.items()
+    }
+
+
+def noise_bounds(diagnosis: Diagnosis) -> dict[str, float]:
+    """Return the fit (6.12) [%] of a perfect model on the held-out logs, by state.
+
+    Empty where the noise is not known, or nothing was held out.
+    """
+    noise = diagnosis.model.noise
+    held = [run.measured for run in diagnosis.runs if run.held_out]
+    if noise is None or not held:
+        return {}
+    bounds = {}
+    for state, std in zip(noise.states, noise.measurement, strict=True):
+        if state not in held[0]:
+            continue
+        measured = np.concatenate([one[state] for one in held])
+        bounds[state] = max(float(fit_percent(measured, measured - float(std))), 0.0)
+    return bounds
+
+
 def noise_sentence(diagnosis: Diagnosis) -> str:
     """Return how much of the error that is left is noise, and the fit that noise alone allows."""
-    budget, noise = diagnosis.budget, diagnosis.model.noise
-    (sensor,) = (p for p in budget if p.part == SENSOR)
-    held = [run.measured for run in diagnosis.runs if run.held_out]
-    told, bounds = [], []
-    for state, own in sensor.after.items():
-        share = min(max(own / max(sum(p.after[state] for p in budget), 1e-300), 0.0), 1.0)
-        name = MOTION_WORDS.get(state, state)
-        told.append(f"{name} {100 * share:.0f} %")
-        if noise is not None and held:
-            std = float(noise.measurement[noise.states.index(state)])
-            least = np.concatenate([np.full(len(one[state]), std) for one in held])
-            measured = np.concatenate([one[state] for one in held])
-            bounds.append(f"{name} {max(fit_percent(measured, measured - least), 0.0):.0f} %")
-    said = f"Sensor noise makes up this much of the squared error that is left: {', '.join(told)}"
+    shares = {s: 100 * share for s, share in noise_shares(diagnosis).items()}
+    bounds = {s: b for s, b in noise_bounds(diagnosis).items() if s in shares}
+    said = (
+        f"Sensor noise makes up this much of the squared error that is left: {told_fits(shares, 0)}"
+    )
     if bounds:
         said += (
             f". Measured with that noise, a perfect model would have a fit of about "
-            f"{', '.join(bounds)}"
+            f"{told_fits(bounds, 0)}"
         )
     return f"{said}."
 

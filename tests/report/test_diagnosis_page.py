@@ -309,7 +309,10 @@ def test_a_share_that_may_be_any_is_not_told():
     assert np.isnan(widths[2][1])
     assert np.isfinite(widths[1]).all()
     unsaid = "Shares that the logs cannot split are not drawn."
-    assert unsaid in diagnosis_page(named, RECORD).lead.caption
+    page = diagnosis_page(named, RECORD)
+    # the picture of what logs do not tell is not the first
+    assert unsaid not in page.lead.caption
+    assert unsaid in page.sections[0].pictures[-1].caption
     assert unsaid not in diagnosis_page(diagnosis_of("named"), RECORD).lead.caption
     assert named.to_dict()["budget"][1]["ci"]["r"] == [-1.6, 1.8]
     assert "current" in largest(BUDGET).split("; ")[-1]
@@ -348,9 +351,19 @@ def test_partly(pages, told):
     # causes first, then what remains
     headline = pages["partly"].headline
     assert headline.startswith("Current: the errors of surge and sway turn")
-    assert headline.endswith("What remains of the error is noise (p = 0.41).")
+    assert "What remains of the error is noise (p = 0.41). You can predict with" in headline
     assert "These causes are confirmed, and an error beyond noise remains." in shown
     assert "No better than a generic force would be: heading_bias." in shown
+
+
+def test_a_model_that_misses_held_out_data_is_not_to_be_predicted_with():
+    named = diagnosis_of("named")
+    gain = {
+        s: Gain(-30.0, fit, (1.0, 9.0)) for s, fit in {"u": 35.0, "v": 60.0, "r": -17.0}.items()
+    }
+    said = diagnosis_page(replace(named, gain=gain), RECORD).headline
+    assert "Do not predict surge, yaw rate with the extended model: on data held out" in said
+    assert "surge 35 %, sway 60 %, yaw rate -17 %" in said
 
 
 def test_every_picture_says_what_it_shows(pages):
@@ -572,5 +585,5 @@ def test_many_causes_stand_by_their_titles_on_the_first_screen():
     # causes of one title are told apart by what they estimate
     told = f"{one.title} ({', '.join(one.parameters)})"
     assert headline.startswith(f"4 causes stand: {told}; another cause; {told}; ")
-    assert headline.endswith("They do not explain all of it.")
+    assert "They do not explain all of it. You can predict with the extended model" in headline
     assert one.evidence not in headline
