@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,8 @@ _ALONE: dict[str, Callable[[Finding], Figure]] = {
     "limit": range_figure, "air": wind_figure, "push": answer_figure, "drift": course_figure,
 }  # fmt: skip
 _log = logging.getLogger(__name__)
+# pictures of findings on a page: ten logs with their signals then stay below 5 MB
+_MOST_DRAWN = 24
 # what makes a force model wrong before what it only has to do without
 _SERIOUS = (
     "frame", "sign", "unit", "clock_offset", "heading_bias", "lever_arm", "time_format",
@@ -135,9 +138,10 @@ def check_page(
             for f in report.findings:
                 shown.setdefault(f.key, report.name)
     sections = []
+    drawn = _most_telling(reports)
     for k, report in enumerate(reports):
         progress(k, len(reports))
-        sections.append(_section(k, report, vessel, points, shown))
+        sections.append(_section(k, report, vessel, points, shown, drawn))
     progress(len(reports), len(reports))
     lead, sections = _apart(reports, sections)
     made = computed(record or {}) | {"vessel": vessel.name}
@@ -208,6 +212,20 @@ def _apart(
     return first, left
 
 
+def _most_telling(reports: Sequence[CheckReport]) -> set[tuple[int, int]]:
+    """Return the findings that a page has room to draw, by log and place in its order.
+
+    Each kind is drawn once before any is drawn again, the most serious first.
+    """
+    count: Counter[str] = Counter()
+    ranked = []
+    for k, report in enumerate(reports):
+        for place, f in enumerate(sorted(report.findings, key=_seriousness)):
+            ranked.append((count[f.id], _seriousness(f), k, place))
+            count[f.id] += 1
+    return {(k, place) for _, _, k, place in sorted(ranked)[:_MOST_DRAWN]}
+
+
 def finding_figure(finding: Finding, report: CheckReport, vessel: Vessel) -> Figure:
     """Draw one finding so that it shows.
 
@@ -257,11 +275,13 @@ def _section(
     vessel: Vessel,
     points: int,
     shown: Mapping[tuple[Any, ...], str],
+    drawn: Container[tuple[int, int]],
 ) -> Section:
     """Return the part of the page on one log.
 
     ``shown`` names the log in which each finding is drawn. One that several logs share is
-    drawn again only where its repair does not help.
+    drawn again only where its repair does not help. Findings that are not in ``drawn`` are told
+    in words.
     """
     _log.info("pictures of %s", report.name)
     pictures: list[Picture] = []
@@ -272,6 +292,9 @@ def _section(
         said = caption(f)
         if report.recording is None:
             sentences.append(said)
+            continue
+        if (number, k) not in drawn:
+            sentences.append(f"{said} Not drawn, as others like it are: check this log alone.")
             continue
         figure, doubt = _drawn(f, report, vessel)
         if len(f.logs) > 1 and shown[f.key] != report.name and not doubt:

@@ -15,7 +15,14 @@ from greybox.commands.main import main
 from greybox.errors import UsageError
 from greybox.report.agreement import compare, find_widths, shifted, smoothed
 from greybox.report.check_ties import make_tie, mended_in_words
-from greybox.report.checks import alternative, caption, check_page, finding_figure, headline
+from greybox.report.checks import (
+    _most_telling,
+    alternative,
+    caption,
+    check_page,
+    finding_figure,
+    headline,
+)
 from greybox.report.figures import to_svg
 from greybox.report.next_steps import after_check
 from greybox.trial.checks.course import course_findings
@@ -442,3 +449,11 @@ def test_in_a_browser(tmp_path, width):
         assert browser.execute_script(
             "return document.querySelector('.broad > svg').getBoundingClientRect().width > 600"
         )
+
+
+def test_a_page_of_many_logs_draws_each_kind_before_it_repeats_one():
+    gap, clock = row_case("gap"), tie_case("clock of r")
+    drawn = _most_telling([gap] * 30 + [clock])
+    assert len(drawn) == 24
+    assert (0, 0) in drawn
+    assert (30, 0) in drawn
