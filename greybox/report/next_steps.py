@@ -78,6 +78,8 @@ def after_import(out: str, vessel: str, lacking: Sequence[str] = ()) -> NextStep
 
 def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextStep]:
     """Return what the verdicts ask for next."""
+    from greybox.diagnosis.preparing import SHORTEST
+
     vessel, model = typed(record, "vessel", "V"), typed(record, "out", "MODEL")
     logs, validate = typed(record, "logs", "LOG…"), typed(record, "validate", "")
     level = estimate.prediction.level if estimate.prediction else PredictionLevel.NOT_JUDGED
@@ -85,7 +87,17 @@ def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextSt
     structure = estimate.predictor.structure
     turns = "r" in structure.states
     steps = []
-    if level in _DOUBTED or trust is TrustLevel.DO_NOT_TRUST:
+    short = max((log["samples"] for log in estimate.logs), default=SHORTEST) < SHORTEST
+    doubtful = level in _DOUBTED or trust is TrustLevel.DO_NOT_TRUST
+    if doubtful and short:
+        steps.append(
+            NextStep(
+                f"Sail a longer trial, since a diagnosis needs {SHORTEST} samples; plan it with "
+                f"this model",
+                f"greybox design --vessel {vessel} --model {model} --duration 900 --out plan.csv",
+            )
+        )
+    elif doubtful:
         held = f" --validate {validate}" if validate else ""
         held += "" if turns else f" --structure {shlex.quote(structure.name)}"
         steps.append(
@@ -193,7 +205,9 @@ def after_comparison(
     given = record.get("command", {}).get("models", ())
     best = comparison.best()
     model = shlex.quote(str(given[best])) if best < len(given) else "MODEL"
-    vessel = typed(models[best].record.get("provenance", {}), "vessel", "V")
+    # a model that states no vessel file is of the same ship as those beside it
+    stated = (typed(m.record.get("provenance", {}), "vessel", "") for m in (models[best], *models))
+    vessel = next(filter(None, stated), "V")
     return NextStep(
         f"Find what '{comparison.names[best]}' gets wrong in these logs, and why",
         f"greybox diagnose {typed(record, 'log', 'LOG…')} --vessel {vessel} --model {model} "
