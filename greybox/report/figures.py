@@ -42,6 +42,9 @@ LABELS = {
 # inches: letters stay legible where the page is 390 px wide
 _WIDTH = 5.2
 
+# inches of a state's free run and its error: three fill the first screen in letters that are read
+_RUN = 1.75
+
 # inches that each further row of a legend needs
 LEGEND_ROW = 0.17
 # points: a letter of a legend, what stands before each of its names, and beside the axes
@@ -115,7 +118,7 @@ def run_axes(
         first = first or top
         below = figure.add_subplot(grid[2 * i + 1], sharex=first)
         unit = labels.get(state, "").partition("[")[2]
-        label_axes(top, y=labels.get(state, state))
+        label_axes(top, y=labels.get(state, state).replace(" [", "\n["))
         label_axes(below, y=error + f"\n[{unit}" * bool(unit), size=size)
         for axes in (top, below):
             axes.yaxis.set_major_locator(MaxNLocator(4 if axes is top else 3))
@@ -158,7 +161,7 @@ def comparison_figure(
     states = list(runs[0].fit)
     columns = legend_columns(["measured", *(f"{shorten(n)}: fit 100.0 %" for n in names)], _WIDTH)
     rows = -(-(len(names) + 1) // columns)
-    figure = new_figure(_WIDTH, (2.1 + LEGEND_ROW * (rows - 1)) * len(states) + 0.6)
+    figure = new_figure(_WIDTH, (_RUN + LEGEND_ROW * (rows - 1)) * len(states) + 0.6)
     t = log.t - log.t[0]
     gaps = find_gaps(log.t, log.sample_time)
     pairs = run_axes(figure, states, LABELS, "difference", 8)

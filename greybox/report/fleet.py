@@ -36,6 +36,8 @@ _MOST_TRENDS = 6
 # deviations [standard deviations] at which the map's colours end
 _REACH = 6.0
 _LABEL = 20
+# coefficients beside one another that a phone shows legibly
+_BROAD = 9
 
 
 def fleet_page(fleet: Fleet, record: Mapping[str, Any]) -> Page:
@@ -92,8 +94,10 @@ def _map(fleet: Fleet) -> Picture:
     ]
     if marked:
         rows, columns = zip(*marked, strict=True)
-        axes.plot(columns, rows, "s", color=VERMILION, markersize=9, fillstyle="none",
-                  markeredgewidth=2)  # fmt: skip
+        # a light rim sets the frame off from the darkest cells
+        for colour, thick in (("white", 4.5), (VERMILION, 2)):
+            axes.plot(columns, rows, "s", color=colour, markersize=11, fillstyle="none",
+                      markeredgewidth=thick)  # fmt: skip
     axes.set_xticks(range(len(fleet.names)), fleet.names, rotation=60, ha="right", fontsize=8,
                     rotation_mode="anchor", parse_math=False)  # fmt: skip
     axes.set_yticks(range(len(shown)), names, fontsize=8, parse_math=False)
@@ -111,7 +115,7 @@ def _map(fleet: Fleet) -> Picture:
         f"{caption} The largest is {deviations[far]:.1f}, {fleet.names[far[1]]} of "
         f"'{fleet.ships[far[0]].name}'."
     )
-    return Picture(to_svg(figure, "map"), caption, told)
+    return Picture(to_svg(figure, "map"), caption, told, broad=len(fleet.names) > _BROAD)
 
 
 def _number(value: float, digits: str = ".4g") -> str:

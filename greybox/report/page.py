@@ -16,6 +16,7 @@ from greybox.report.next_steps import NextStep
 
 if TYPE_CHECKING:
     from jinja2 import Template
+    from markupsafe import Markup
 
     from greybox.report.chart import Chart
 
@@ -171,7 +172,7 @@ h2 { font-size: 1.15rem; margin: 1.6rem 0 0.4rem; }
 .next li { overflow-wrap: anywhere; } .next li + li { margin-top: 0.4rem; }
 .next code { font-size: 0.85rem; background: #f6f6f6; }
 .next code span { display: inline-block; max-width: 100%; }
-.lead figure { margin: 0.6rem 0 0; }
+.lead figure { margin: 0.6rem 0 0; } .whole { white-space: nowrap; }
 @media screen and (min-width: 900px) {
   .first.led { display: grid; grid-template: auto 1fr / minmax(0, 2fr) minmax(0, 3fr);
                gap: 0 2rem; }
@@ -300,7 +301,7 @@ def _template() -> Template:
     from jinja2 import Environment
 
     environment = Environment(autoescape=True, trim_blocks=True)
-    environment.filters["tie_units"] = tie_units
+    environment.filters["tie_units"] = _keep_whole
     return environment.from_string(_TEMPLATE)
 
 
@@ -316,6 +317,14 @@ def _policy(scripts: Sequence[str]) -> str:
 def tie_units(text: str) -> str:
     """Return text in which a line does not end between a number and its unit."""
     return re.sub(r"(?<=\d) (?=(?:m/s|rad/s|kn|m|s|%|min)(?:\W|$))", "\u00a0", text)
+
+
+def _keep_whole(text: str) -> Markup:
+    """Return text as HTML in which a line does not end within an option of a command."""
+    from markupsafe import Markup, escape
+
+    whole = r"(?<![\w-])(--[a-z][a-z-]*(?: [a-z][a-z_]*(?=\)))?)"
+    return Markup(re.sub(whole, r'<span class="whole">\1</span>', str(escape(tie_units(text)))))
 
 
 def capital(text: str) -> str:

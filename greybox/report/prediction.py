@@ -32,7 +32,7 @@ from greybox.report.figures import (
 )
 from greybox.report.next_steps import after_prediction
 from greybox.report.page import Page, Picture, Section, Table, capital, computed
-from greybox.trial.manoeuvres import Compliance
+from greybox.trial.manoeuvres import Compliance, Criterion
 
 Array = NDArray[np.float64]
 
@@ -71,10 +71,10 @@ def headline(made: ManoeuvrePrediction) -> str:
     judged = [
         c for m in made.manoeuvres for c in m.criteria if c.verdict is not Compliance.NOT_APPLICABLE
     ]
-    of = {v: [c.name for c in judged if c.verdict is v] for v in Compliance}
+    of = {v: [_against(c) for c in judged if c.verdict is v] for v in Compliance}
     parts = [
         f"{len(of[v])} of {len(judged)} {word}"
-        + (f" ({', '.join(dict.fromkeys(of[v]))})" if v is not Compliance.PASS else "")
+        + (f" ({'; '.join(dict.fromkeys(of[v]))})" if v is not Compliance.PASS else "")
         for v, word in (
             (Compliance.PASS, "met"),
             (Compliance.FAIL, "failed"),
@@ -106,6 +106,16 @@ def headline(made: ManoeuvrePrediction) -> str:
         * bool(made.instant and made.kind in ("turning", "zigzag")),
     ]
     return f"{told} But {' and '.join(doubts)}." if doubts else told
+
+
+def _against(criterion: Criterion) -> str:
+    """Return what a limit is of, with the value that was found and the limit."""
+    found, limit = criterion.measured, limit_words(criterion)
+    if found is None or not limit:
+        return criterion.name
+    angle = found.unit == "rad"
+    value = f"{math.degrees(found.value):.1f} deg" if angle else f"{found.value:.2f} L"
+    return f"{criterion.name} {value}, at most {limit}"
 
 
 def _section(made: PredictedManoeuvre, key: str) -> Section:

@@ -74,7 +74,7 @@ def test_comparison_figure_has_labels_and_units(clean_log, thesis, true_theta):
     ).model()
     figure = comparison_figure(["m"], [run_model(model, clean_log)])
     labels = [a.get_ylabel() for a in figure.axes]
-    assert "surge u [m/s]" in labels
+    assert "surge u\n[m/s]" in labels
     several = [f"{k}_{'x' * 40}" for k in range(3)]
     run = run_model(model, clean_log)
     for names in (["m"], several):
