@@ -160,7 +160,10 @@ class Certificate(DisplayMixin):
     def sentence(self) -> str:
         """Return one sentence for the summary of a design."""
         if self.kind is Kind.NOT_INFORMATIVE:
-            return "certificate: not informative (its bound is more than 10 times the plan)"
+            return (
+                "certificate: not informative (how near the plan is to the best one is not known: "
+                "the bound is more than 10 times the plan)"
+            )
         if self.efficiency_lower_bound is None:
             return f"certificate: not available because {self.reason}"
         kind = "proven" if self.rigorous else "numerical bound"

@@ -321,12 +321,16 @@ class LargeError(Reason):
         if self.error >= 1:
             when = f"after {seconds(self.horizon)}" if self.horizon > 0 else "from the start"
             return f"{who} is worse than a constant {when}"
-        # what is above a limit must not be rounded to it
-        digits = 0 if round(100 * self.error) > round(100 * self.limit) else 1
         return (
-            f"the error of {who} is {100 * self.error:.{digits}f} % of its spread "
+            f"the error of {who} is {self.percent} % of its spread "
             f"({100 * self.limit:.0f} % is allowed)"
         )
+
+    @property
+    def percent(self) -> str:
+        """The error in percent; what is above a limit must not be rounded to it."""
+        digits = 0 if round(100 * self.error) > round(100 * self.limit) else 1
+        return f"{100 * self.error:.{digits}f}"
 
 
 @dataclass(frozen=True)
@@ -545,9 +549,21 @@ class PredictionVerdict(DisplayMixin):
     @property
     def reason(self) -> str:
         """Why this level, in one sentence without its stop."""
-        decisive = [r.sentence for r in self.because if r.fatal]
-        if decisive:
-            return "; ".join(decisive)
+        fatal = [r for r in self.because if r.fatal]
+        several = [r for r in fatal if isinstance(r, LargeError) and r.error < 1]
+        if len(several) > 1:
+            # one sentence for all channels of which the same is said
+            told = ", ".join(f"{channel_words(r.channel)} {r.percent} %" for r in several)
+            whole = (
+                f"the error is too large a share of the spread ({told}; "
+                f"{100 * several[0].limit:.0f} % is allowed)"
+            )
+            sentences = [
+                whole if r is several[0] else r.sentence for r in fatal if r not in several[1:]
+            ]
+            return "; ".join(sentences)
+        if fatal:
+            return "; ".join(r.sentence for r in fatal)
         if self.level is not PredictionLevel.GOOD:
             return "tests and held-out runs were not asked for"
         return (

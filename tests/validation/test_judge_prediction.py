@@ -229,3 +229,11 @@ def test_errors_on_the_own_logs_and_their_memory_are_kept(log):
     assert found["own_rmse"]["v"] < 0.5 * found["rmse"]["v"]
     assert found["memory"]["v"] > 2.0
     assert judge_prediction([wrong]).to_dict()["own_rmse"] == {}
+
+
+def test_large_errors_of_several_channels_are_one_sentence():
+    found = judged(channel("u", 0.85), channel("v", 0.9), channel("r", 1.2))
+    assert found.text == (
+        "poor: the error is too large a share of the spread (surge 85 %, sway 90 %; 50 % is "
+        "allowed); yaw rate is worse than a constant after 40 s"
+    )
