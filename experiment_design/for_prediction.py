@@ -215,18 +215,14 @@ def command_ranges(
     """
     shown = model.record.get("ranges")
     shown = shown if isinstance(shown, Mapping) else {}
-    angles = {t.rudder for t in model.vessel.thrusters} | {
-        t.angle for t in model.vessel.thrusters if isinstance(t.angle, str)
-    }
-    tunnels = {t.speed for t in model.vessel.thrusters if t.type == "tunnel"}
-    found = {}
+    two_sided, found = _two_sided(model.vessel), {}
     for name, limits in model.vessel.limits.items():
         low = -np.inf if limits.lower is None else limits.lower
         high = np.inf if limits.upper is None else limits.upper
         if name in given:
             found[name] = given[name]
             continue
-        both = name in angles or name in tunnels
+        both = name in two_sided
         if name in shown:
             first, last = (float(v) for v in shown[name])
             wide = _BEYOND * (last - first)
@@ -302,9 +298,10 @@ def planning_model(model: ManoeuvringModel, vessel: Vessel) -> tuple[Manoeuvring
     if found.structure.states != model.structure.states:
         return model, ""
     ranges = {n: shown[n] for n in vessel.commands if n in shown}
+    settings = model.record.get("settings", {})
     # how well the prior followed its own log says nothing of main dimensions
     level = {"prediction": {"level": prediction.get("level", "")}}
-    record = {**found.record, "ranges": ranges, "verdict": level}
+    record = {**found.record, "ranges": ranges, "settings": settings, "verdict": level}
     said = (
         f"the prior is not planned with: {fatal[0].get('sentence', 'its free run diverges')}; "
         f"the ship's main dimensions take its place"
@@ -339,6 +336,37 @@ def ranges_of_ship(
     return command_ranges(model, given)
 
 
+def shown_settings(
+    model: ManoeuvringModel, commands: Sequence[str], given: Mapping[str, tuple[float, float]]
+) -> Array | None:
+    """Return settings of the commands (K, nc) between which the prior's trial used the ship.
+
+    To both sides, and as far beyond as `command_ranges` goes; nan for a command whose range is
+    given. None where the model's record holds none.
+    """
+    record = model.record.get("settings")
+    if not isinstance(record, Mapping) or not all(c in record or c in given for c in commands):
+        return None
+    count = min((len(record[c]) for c in commands if c not in given), default=0)
+    if not count:
+        return None
+    shown = np.full((count, len(commands)), np.nan)
+    for i, c in enumerate(commands):
+        if c not in given:
+            shown[:, i] = record[c][:count]
+    middle = (shown.min(axis=0) + shown.max(axis=0)) / 2
+    shown = middle + (1 + 2 * _BEYOND) * (shown - middle)
+    sides = np.where([c in _two_sided(model.vessel) for c in commands], -1.0, 1.0)
+    return np.concatenate([shown, sides * shown])
+
+
+def _two_sided(vessel: Vessel) -> set[str]:
+    """Return the commands that push to starboard with one sign and to port with the other."""
+    angles = {t.angle for t in vessel.thrusters if isinstance(t.angle, str)}
+    rudders = {t.rudder for t in vessel.thrusters if isinstance(t.rudder, str)}
+    return angles | rudders | {t.speed for t in vessel.thrusters if t.type == "tunnel"}
+
+
 def operating_envelope(
     request: PreparedRequest, model: ManoeuvringModel, given: Mapping[str, tuple[float, float]]
 ) -> tuple[Envelope, str]:
@@ -365,8 +393,9 @@ def operating_envelope(
     ranges = ranges_of_ship(request, model, given)
     rollout = build_problem(request).scenarios[0].rollout
     found = build_envelope(
-        rollout, predictor, request.noise, request.schedule, ranges, speeds, misfit, request.seed
-    )
+        rollout, predictor, request.noise, request.schedule, ranges, speeds, misfit, request.seed,
+        shown_settings(model, request.schedule.commands, given),
+    )  # fmt: skip
     return found, level
 
 

@@ -50,6 +50,8 @@ _CENTRES = 40
 _SAMPLES = 160
 # share of the settings that count as straight, and how often one of these is held
 _STRAIGHT, _COURSE = 0.1, 0.25
+# how much more than a setting by its width it counts that shares of settings add up to one
+_ADD_UP = 1e3
 # slowest and fastest surge of the envelope, in what the prior's trial showed
 _SLOWEST, _FASTEST = 0.55, 1.1
 # what not even the potential terms say, as a share of the spread of each state
@@ -325,6 +327,7 @@ def build_envelope(
     speeds: tuple[float, float] | None,
     misfit: Array,
     seed: int,
+    shown: Array | None = None,
 ) -> Envelope:
     """Compute the operating envelope of a ship from her prior model.
 
@@ -345,6 +348,10 @@ def build_envelope(
     misfit : ndarray
         (nx,) error of the prior's free runs as a share of the spread of each state.
     seed : int
+    shown : ndarray, optional
+        (K, nc) settings of all commands that the prior's trial showed: what the ship is used for
+        lies between them, which of a ship with two propellers is less than all that both could do;
+        nan where the range of a command says it instead. By default every range does.
 
     Raises
     ------
@@ -367,18 +374,20 @@ def build_envelope(
         )
     dt, nx, length = rollout.sample_time, rollout.nx, rollout.vessel.length
     tried = lower + (upper - lower) * rng.random((_TRIED, len(lower)))
-    shown = (-np.inf, np.inf)
+    if shown is not None:
+        tried = _between(tried, np.clip(shown, lower, upper), upper - lower)
+    surge = (-np.inf, np.inf)
     fast = 1.0 if speeds is None else max(abs(speeds[0]), abs(speeds[1]))
     if speeds is not None and speeds[0] > 0:
-        shown = (_SLOWEST * speeds[0], _FASTEST * speeds[1])
+        surge = (_SLOWEST * speeds[0], _FASTEST * speeds[1])
     scale = max((length or 20 * fast) / fast, 4 * dt)
     settled = rollout.run(np.repeat(tried[:, None], int(_SETTLING * scale / dt), axis=1))
     steady = settled.state[:, -1, :nx]
     if speeds is None:
         fast = float(np.quantile(steady[settled.stable, 0], 0.98)) if settled.stable.any() else 1.0
-        shown = (0.2 * fast, np.inf)
+        surge = (0.2 * fast, np.inf)
         scale = max((length or 20 * fast) / fast, 4 * dt)
-    held = _within(settled, shown)[:, -1]
+    held = _within(settled, surge)[:, -1]
     if held.any():
         # where a crew would begin: on a course, at speed
         course = _straight(steady[held])
@@ -389,7 +398,7 @@ def build_envelope(
             settled = rollout.run(np.repeat(plain[:, None], settled.tau.shape[1], axis=1))
             x, size = settled.state[:, -1, :nx], steady[held].std(axis=0)
             # as straight as the fastest one that was drawn, and no faster
-            good = _within(settled, shown)[:, -1] & (x[:, 0] <= start[0])
+            good = _within(settled, surge)[:, -1] & (x[:, 0] <= start[0])
             good &= (np.abs(x[:, 1:]) <= np.abs(start[1:]) + 0.1 * size[1:]).all(axis=1)
             ahead = plain[good]
             if good.any():
@@ -400,7 +409,7 @@ def build_envelope(
         )  # fmt: skip
         motion = rollout.run(np.repeat(tried[:, None], int(HOLDS[1] * scale / dt), axis=1))
         # until when a setting keeps the ship within the envelope, at most the longest hold
-        kept = np.logical_and.accumulate(_within(motion, shown), axis=1).sum(axis=1) - 1
+        kept = np.logical_and.accumulate(_within(motion, surge), axis=1).sum(axis=1) - 1
         held = kept >= HOLDS[0] * scale / dt
     if held.mean() < HELD:
         raise InfeasibleError(
@@ -416,7 +425,7 @@ def build_envelope(
         [_drawn(settings, kept, straight, samples, scale / dt, rng) for _ in range(_SEQUENCES)]
     )
     motion = rollout.run(used)
-    inside = _within(motion, shown)[:, :-1]
+    inside = _within(motion, surge)[:, :-1]
     if inside.mean() < HELD:
         raise InfeasibleError(
             f"the prior model leaves the speeds of its own trial for "
@@ -441,9 +450,29 @@ def build_envelope(
     variance = np.asarray(noise.measurement, float) ** 2 + lasting * by_step
     precision = np.concatenate([np.zeros(len(predictor.columns)), 1 / tau])
     return Envelope(
-        rollout, begun, ahead, predictor, variance, lower, upper, shown, settings, kept * dt,
+        rollout, begun, ahead, predictor, variance, lower, upper, surge, settings, kept * dt,
         reached, straight, scale, share, spread, features, moments, precision,
     )  # fmt: skip
+
+
+def _between(tried: Array, shown: Array, width: Array) -> Array:
+    """Return settings (M, nc), moved to the nearest ones between those that were shown, (K, nc).
+
+    Nearest in units of a width of each command; those that are nan in `shown` stay.
+    """
+    from scipy.optimize import nnls
+
+    bound = np.flatnonzero(~np.isnan(shown).any(axis=0))
+    if not len(bound):
+        return tried
+    unit = np.where(width > 0, width, 1.0)[bound]
+    # shares of the shown settings that add up to one
+    rows = np.vstack([(shown[:, bound] / unit).T, np.full(len(shown), _ADD_UP)])
+    out = tried.copy()
+    for setting in out:
+        shares, _ = nnls(rows, np.append(setting[bound] / unit, _ADD_UP))
+        setting[bound] = shares @ shown[:, bound] / shares.sum()
+    return out
 
 
 def _straight(reached: Array) -> NDArray[np.intp]:

@@ -58,7 +58,7 @@ from greybox.numerics.linalg import scaled_inverse, sizes
 from greybox.numerics.parallel import map_forked
 from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
-from greybox.trial.validity import ranges
+from greybox.trial.validity import ranges, settings_of
 from greybox.validation.bands import LEVEL, Z, predict_bands
 from greybox.validation.fit import LogFit, fit_on
 
@@ -277,6 +277,7 @@ class DiagnosisBuilder:
                 for log in logs
             ],
             "ranges": ranges(logs, self.structure.states),
+            "settings": settings_of(logs),
         }
 
     def _groups(self) -> list[list[Candidate]]:

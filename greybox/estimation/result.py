@@ -300,6 +300,7 @@ class Estimate(EstimateValues, DisplayMixin):
             },
             "logs": list(self.logs),
             "ranges": dict(self.data.ranges),
+            "settings": {n: list(v) for n, v in self.data.settings.items()},
             "actuators": [a.to_dict() for a in self.actuators],
             "condition_differences": [d.to_dict() for d in self.conditions.differences],
         }

@@ -17,7 +17,7 @@ from greybox.model.predictor import Predictor
 from greybox.model.run.step import Integrator
 from greybox.trial.actuator_estimate import ActuatorEstimate, known_actuators
 from greybox.trial.log import TrialLog
-from greybox.trial.validity import PooledConditions, pooled_conditions, ranges
+from greybox.trial.validity import PooledConditions, pooled_conditions, ranges, settings_of
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -86,6 +86,8 @@ class EstimationData:
         Name, hash and length of each log.
     ranges : dict of str to (float, float)
         Least and greatest value of each state and command in the logs.
+    settings : dict of str to list of float
+        Of all commands together, those of the logs that are most unlike one another.
     conditions : PooledConditions
         Draught, depth and the like of the logs, and in what they differ.
     actuators : tuple of ActuatorEstimate
@@ -96,6 +98,7 @@ class EstimationData:
     kept: int
     logs: tuple[dict[str, Any], ...] = ()
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    settings: Mapping[str, Sequence[float]] = field(default_factory=dict)
     conditions: PooledConditions = field(default_factory=PooledConditions)
     actuators: tuple[ActuatorEstimate, ...] = ()
 
@@ -111,6 +114,7 @@ def estimation_data(
             {"name": log.name, "sha256": log.provenance.sha256, "samples": len(log)} for log in logs
         ),
         ranges(logs, tuple(states)),
+        settings_of(logs),
         pooled_conditions(logs),
         known_actuators(log.provenance.actuators for log in logs),
     )

@@ -18,7 +18,7 @@ from greybox.selection.prediction import part_of_estimate
 from greybox.trial.actuator_estimate import known_actuators
 from greybox.trial.log import TrialLog
 from greybox.trial.stream import LogStream, Place
-from greybox.trial.validity import pooled_conditions, ranges
+from greybox.trial.validity import pooled_conditions, ranges, settings_of, unlike
 
 Array = NDArray[np.float64]
 
@@ -104,11 +104,12 @@ class Drawn:
 
 @dataclass(frozen=True)
 class _Segment:
-    """A segment's stretches that tell most, with their moments (k, k), and its ranges."""
+    """A segment's stretches that tell most, with their moments (k, k), ranges and settings."""
 
     samples: int
     stretches: tuple[tuple[int, int, Array], ...]
     ranges: dict[str, tuple[float, float]]
+    settings: dict[str, list[float]]
 
 
 def draw(stream: LogStream, structure: Structure) -> Drawn:
@@ -168,6 +169,7 @@ def _look_at(predictor: Predictor, log: TrialLog) -> _Segment:
         len(log),
         tuple((k * length, (k + 1) * length, moments[k]) for k in _greedy(moments, _OF_SEGMENT)),
         ranges([log], states),
+        settings_of([log]),
     )
 
 
@@ -201,6 +203,8 @@ def _data(stream: LogStream, log: TrialLog, segments: Sequence[_Segment]) -> Est
         for name, (low, high) in segment.ranges.items():
             least, most = found.get(name, (low, high))
             found[name] = min(low, least), max(high, most)
+    names = [n for n in segments[0].settings if all(n in s.settings for s in segments)]
+    all_settings = {n: np.concatenate([s.settings[n] for s in segments]) for n in names}
     # conditions are those of the records beside the files
     heads = [replace(log.window(0, 2, f.file.name), provenance=f.known) for f in stream.parts]
     samples = sum(s.samples for s in segments)
@@ -211,6 +215,7 @@ def _data(stream: LogStream, log: TrialLog, segments: Sequence[_Segment]) -> Est
             {"name": f.file.name, "sha256": f.known.sha256, "samples": f.rows} for f in stream.parts
         ),
         found,
+        unlike(all_settings) if names else {},
         pooled_conditions(heads),
         known_actuators(f.known.actuators for f in stream.parts),
     )

@@ -10,10 +10,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import shortened
 from greybox.vessel.conditions import UNITS, Conditions, Value, spelled, words
+
+Array = NDArray[np.float64]
 
 # field -> values of the logs of a model, ascending, each once
 Validity = Mapping[str, tuple[Any, ...]]
@@ -32,6 +35,8 @@ _SEA = 2
 _MOST_NAMED = 3
 # share of the samples left out at either end of a range: single ones are outliers
 _TAIL = 1e-3
+# settings that stand for all of a log
+_SETTINGS = 16
 
 
 @dataclass(frozen=True)
@@ -221,3 +226,40 @@ def ranges(logs: Sequence[TrialLog], states: Sequence[str]) -> dict[str, tuple[f
             before = found.get(name, (low, high))
             found[name] = min(low, before[0]), max(high, before[1])
     return found
+
+
+def settings_of(logs: Sequence[TrialLog]) -> dict[str, list[float]]:
+    """Return settings of all commands that the logs had at one time, by command.
+
+    Up to 16, as unlike one another as the logs allow: the others lie between them.
+
+    Parameters
+    ----------
+    logs : sequence of TrialLog
+        Of one vessel.
+
+    Returns
+    -------
+    dict of str to list of float
+        The k-th values of all commands stood together; commands that not every log has are left
+        out [propeller speeds in the unit of the log, angles in rad].
+    """
+    names = [n for n in logs[0].vessel.commands if all(n in log for log in logs)]
+    if not names:
+        return {}
+    return unlike({n: np.concatenate([np.asarray(log[n], float) for log in logs]) for n in names})
+
+
+def unlike(settings: Mapping[str, Sequence[float] | Array]) -> dict[str, list[float]]:
+    """Return those of many settings that are farthest from one another, in deviations."""
+    values = np.column_stack([np.asarray(v, float) for v in settings.values()])
+    values = values[np.isfinite(values).all(axis=1)]
+    if not len(values):
+        return {}
+    scaled = (values - values.mean(axis=0)) / np.maximum(values.std(axis=0), 1e-12)
+    chosen = [int(np.argmax((scaled**2).sum(axis=1)))]
+    away = ((scaled - scaled[chosen[0]]) ** 2).sum(axis=1)
+    while len(chosen) < _SETTINGS and away.max() > 0:
+        chosen.append(int(np.argmax(away)))
+        away = np.minimum(away, ((scaled - scaled[chosen[-1]]) ** 2).sum(axis=1))
+    return dict(zip(settings, values[chosen].T.tolist(), strict=True))

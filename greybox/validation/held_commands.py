@@ -17,12 +17,11 @@ from greybox.estimation.prediction_verdict import LIMITS, HeldCommandsDiverge, S
 from greybox.model.model import ManoeuvringModel
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
+from greybox.trial.validity import settings_of
 from greybox.validation.fit import run_model
 
 Array = NDArray[np.float64]
 
-# settings that are held
-_SETTINGS = 16
 # of the greatest speed ahead: no ship that only pushes ahead goes astern faster than a current
 _ASTERN = 0.5
 
@@ -97,27 +96,12 @@ def held_commands(logs: Sequence[TrialLog]) -> list[TrialLog]:
     list of TrialLog
         Up to 16, the settings as unlike one another as the logs allow; none without commands.
     """
-    longest = max(logs, key=len)
-    names = [n for n in longest.vessel.commands if all(n in log for log in logs)]
-    if not names:
-        return []
-    settings = _unlike(np.concatenate([np.stack([g[n] for n in names], 1) for g in logs]))
+    longest, settings = max(logs, key=len), settings_of(logs)
     return [
         replace(
             longest,
             channels={**longest.channels}
-            | {n: np.full(len(longest), v) for n, v in zip(names, values, strict=True)},
+            | {n: np.full(len(longest), v) for n, v in zip(settings, values, strict=True)},
         )
-        for values in settings
+        for values in zip(*settings.values(), strict=True)
     ]
-
-
-def _unlike(settings: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return those of the (N, nc) settings that are farthest from one another, in deviations."""
-    scaled = (settings - settings.mean(axis=0)) / np.maximum(settings.std(axis=0), 1e-12)
-    chosen = [int(np.argmax((scaled**2).sum(axis=1)))]
-    away = ((scaled - scaled[chosen[0]]) ** 2).sum(axis=1)
-    while len(chosen) < _SETTINGS and away.max() > 0:
-        chosen.append(int(np.argmax(away)))
-        away = np.minimum(away, ((scaled - scaled[chosen[-1]]) ** 2).sum(axis=1))
-    return settings[chosen]

@@ -23,6 +23,7 @@ from experiment_design.for_prediction import (
     operating_envelope,
     planning_model,
     prior_misfit,
+    shown_settings,
     started_in,
 )
 from experiment_design.information.envelope import _sensitivities, build_envelope
@@ -52,7 +53,7 @@ def request_of(**changes):
     return make_request(**changes)
 
 
-def envelope_of(request, seed=0, speeds=None, **given):
+def envelope_of(request, seed=0, speeds=None, shown=None, **given):
     predictor = build_predictor(request.structure, "basic", (("u", (1, -1)),))
     rollout = Rollout(
         request.vessel, request.structure, request.theta, request.d, request.starts[0],
@@ -61,7 +62,7 @@ def envelope_of(request, seed=0, speeds=None, **given):
     ranges = {n: (float(v.lower), float(v.upper)) for n, v in request.vessel.limits.items()}
     return build_envelope(
         rollout, predictor, request.noise, request.schedule, ranges | given, speeds,
-        np.full(3, 0.2), seed,
+        np.full(3, 0.2), seed, shown,
     )  # fmt: skip
 
 
@@ -424,6 +425,47 @@ def test_ranges_are_those_of_the_trial_to_both_sides(model) -> None:
     assert ranges["alpha1"] == pytest.approx((-0.45, 0.45))
     given = command_ranges(replace(model, vessel=ship), {"n": (11.0, 13.0)})
     assert given["n"] == (11.0, 13.0)
+
+
+def test_settings_lie_between_those_that_the_trial_showed() -> None:
+    request = request_of()
+    columns = request.schedule.commands
+    (n, one, other), (low, high) = (columns.index(c) for c in ("n", "alpha1", "alpha2")), (0.6, 1.1)
+    shown = np.zeros((3, 3))
+    shown[:, n], shown[:, one], shown[:, other] = (
+        (12.0, 18.0, 18.0), (low, high, low), (low, high, high),
+    )  # fmt: skip
+    found = envelope_of(request, shown=shown).settings
+    # barycentric coordinates in the triangle of what was shown
+    corners = np.vstack([shown.T, np.ones(3)])
+    shares = np.linalg.lstsq(corners, np.vstack([found.T, np.ones(len(found))]), rcond=None)[0]
+    np.testing.assert_allclose(corners[:3] @ shares, found.T, atol=1e-4)
+    assert shares.min() > -1e-4
+    # each corner is used, and what lies between
+    assert (shares > 0.9).any(axis=1).all()
+    assert ((shares > 0.1).all(axis=0)).any()
+    # a command whose range is given goes as far as that
+    shown[:, n] = np.nan
+    found = envelope_of(request, shown=shown).settings
+    assert found[:, n].min() < 11
+    assert found[:, n].max() > 19
+    # the plane of both angles is a triangle
+    assert found[:, one].max() > 1.0
+    assert not ((found[:, one] > 1.0) & (found[:, other] < 0.7)).any()
+
+
+def test_shown_settings_go_to_both_sides_and_as_far_as_ranges(model) -> None:
+    ship = limited_ship(angles=(-1.0, 1.0))
+    record = {"settings": {"n": [12.0, 16.0], "alpha1": [-0.1, 0.4], "alpha2": [0.2, 0.2]}}
+    prior, names = replace(model, vessel=ship, record=record), ("n", "alpha1", "alpha2")
+    found = shown_settings(prior, names, {})
+    np.testing.assert_allclose(
+        found, [[11.6, -0.15, 0.2], [16.4, 0.45, 0.2], [11.6, 0.15, -0.2], [16.4, -0.45, -0.2]]
+    )
+    given = shown_settings(prior, names, {"n": (11.0, 13.0)})
+    assert np.isnan(given[:, 0]).all()
+    np.testing.assert_array_equal(given[:, 1:], found[:, 1:])
+    assert shown_settings(replace(prior, record={}), names, {}) is None
 
 
 def test_a_prior_that_cannot_hold_the_ship_is_refused() -> None:

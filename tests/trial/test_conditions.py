@@ -22,7 +22,7 @@ from greybox.trial.import_files import import_files
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import make_log
 from greybox.trial.store import write_log
-from greybox.trial.validity import other_conditions, pooled_conditions
+from greybox.trial.validity import other_conditions, pooled_conditions, settings_of
 from greybox.validation.comparison import compare
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
@@ -268,3 +268,19 @@ def test_the_shell_tells_them(tmp_path, capsys, logs, estimate):
     status, out, error = run(capsys, "compare", model, "--log", log, "--no-bands")
     assert status == 0, error
     assert sentence in out
+
+
+def test_settings_stood_together_in_a_log_and_reach_its_ends():
+    logs = [virtual_log(70 + k, 200, name=f"log{k}") for k in range(2)]
+    found = settings_of(logs)
+    names = logs[0].vessel.commands
+    assert tuple(found) == names
+    rows = np.concatenate([np.column_stack([log[n] for n in names]) for log in logs])
+    settings = np.column_stack([found[n] for n in names])
+    assert 2 < len(settings) <= 16
+    for setting in settings:
+        assert (rows == setting).all(axis=1).any()
+    spread = np.ptp(rows, axis=0)
+    assert (np.ptp(settings, axis=0) > 0.8 * spread)[spread > 0].all()
+    model = estimate_model(logs, method="ls", structure="thesis").model()
+    assert model.record["settings"] == found
