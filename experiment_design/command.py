@@ -16,6 +16,7 @@ from greybox.commands.common import (
     add_cluster,
     add_seed,
     at_least_one,
+    by_name,
     count,
     drawn,
     positive,
@@ -417,7 +418,7 @@ def _run_for_coefficients(
     if options.target:
         request = least_duration(
             request,
-            dict(_target(text) for text in options.target),
+            by_name("--target", map(_target, options.target)),
             best_effort=options.best_effort,
             progress=progress("duration"),
             workers=options.workers,
@@ -584,7 +585,7 @@ def _run_for_prediction(
     found = design_for_prediction(
         request,
         model,
-        envelope=dict(_range(text, vessel) for text in options.envelope),
+        envelope=by_name("--envelope", (_range(text, vessel) for text in options.envelope)),
         kept_starts=options.trials if options.start is not None else int(ended),
         best_effort=options.best_effort,
         workers=options.workers,
@@ -627,7 +628,7 @@ def _run_for_causes(
         request,
         model,
         causes,
-        envelope=dict(_range(text, vessel) for text in options.envelope),
+        envelope=by_name("--envelope", (_range(text, vessel) for text in options.envelope)),
         kept_start=options.start is not None,
         best_effort=options.best_effort,
         workers=options.workers,
@@ -781,7 +782,7 @@ def _asked(options: argparse.Namespace, model: Any, sailed: Any = None) -> Any:
         clearance=options.clearance,
         speed_cap=options.speed_cap,
         yaw_cap=options.yaw_cap,
-        end=dict(_end(text) for text in options.end),
+        end=by_name("--end", map(_end, options.end)),
         energy=options.energy,
         headings=options.headings,
     )

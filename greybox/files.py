@@ -74,6 +74,11 @@ def nearest_file(path: str | Path, known: Iterable[str] = ()) -> str:
     return f" Did you mean '{found}'?" if found else ""
 
 
+def real_path(path: str | Path) -> Path:
+    """Return a path without links, as far as they lead; those that lead round stay."""
+    return Path(os.path.realpath(path))
+
+
 def make_folder(path: str | Path) -> Path:
     """Make a folder, and those that it stands in, where they do not exist.
 
@@ -110,7 +115,7 @@ def replacing(path: str | Path, mode: str = "w") -> Iterator[IO[Any]]:
         with open(path, mode, **options) as handle:
             yield handle
         return
-    named, path = path, path.resolve()
+    named, path = path, real_path(path)
     try:
         handle = tempfile.NamedTemporaryFile(  # noqa: SIM115 - closed below
             mode, dir=path.parent, prefix=f".{path.name}.", delete=False, **options

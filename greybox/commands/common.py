@@ -6,11 +6,11 @@ import argparse
 import logging
 import platform
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from hashlib import file_digest
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from greybox.commands.terminal import complain, counted, progress, say
 
@@ -24,11 +24,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "VESSEL_HELP", "add_cluster", "add_logs", "add_memory", "add_outputs", "add_seed",
-    "at_least_one", "complain", "configured", "count", "counted", "drawn", "leave_to_others",
-    "positive", "progress", "provenance", "publish", "read_logs", "say", "show_next",
-    "tell_drawing",
+    "at_least_one", "by_name", "complain", "configured", "count", "counted", "drawn", "is_named",
+    "leave_to_others", "positive", "progress", "provenance", "publish", "read_logs", "say",
+    "show_next", "tell_drawing",
 ]  # fmt: skip
 
+Value = TypeVar("Value")
 _log = logging.getLogger(__name__)
 # what is told while pages are made
 _DRAWING = "drawing the page"
@@ -39,8 +40,8 @@ _MEMORY = 4.0
 VESSEL_HELP = "vessel file (TOML), as 'greybox import --help' shows one, or thesis or ferry"
 # where a command computes changes no result
 SHELL_ONLY = (
-    "run", "stages", "typed", "verbose", "more_verbose", "quiet", "no_config", "configuration",
-    "cluster",
+    "run", "stages", "typed", "named", "verbose", "more_verbose", "quiet", "no_config",
+    "configuration", "cluster",
 )  # fmt: skip
 
 
@@ -316,6 +317,29 @@ def configured(options: argparse.Namespace) -> list[str]:
     return record.get("options", [])
 
 
+def by_name(option: str, found: Iterable[tuple[str, Value]]) -> dict[str, Value]:
+    """Return what an option gives by name.
+
+    Raises
+    ------
+    UsageError
+        A name stands twice.
+    """
+    from greybox.errors import UsageError
+
+    values: dict[str, Value] = {}
+    for name, value in found:
+        if name in values:
+            raise UsageError(f"{option} gives '{name}' twice: keep one of them.")
+        values[name] = value
+    return values
+
+
+def is_named(options: argparse.Namespace, name: str) -> bool:
+    """Return whether an option stands on the command line or in the file, if as its default."""
+    return name in getattr(options, "named", ())
+
+
 def leave_to_others(options: argparse.Namespace, name: str, default: Any) -> bool:
     """Take back an option that only the configuration file gives; return whether it was one.
 
@@ -324,6 +348,7 @@ def leave_to_others(options: argparse.Namespace, name: str, default: Any) -> boo
     if name not in (given := configured(options)):
         return False
     given.remove(name)
+    options.named.discard(name)
     setattr(options, name, default)
     return True
 
@@ -337,6 +362,7 @@ def require_apart(options: argparse.Namespace) -> None:
         Names the file and both options.
     """
     from greybox.errors import UsageError
+    from greybox.files import real_path
 
     require_ending(getattr(options, "report", None), ".html", "a page", "--report")
     taken: dict[Path, str] = {}
@@ -344,15 +370,18 @@ def require_apart(options: argparse.Namespace) -> None:
         paths = _paths(getattr(options, name, None))
         if "" in paths:
             raise UsageError(f"a file of {name} has an empty name: name a file.")
-        taken |= {Path(p).resolve(): name for p in paths}
+        taken |= {real_path(p): name for p in paths}
     for name in OUTPUTS:
         option = name.replace("_", "-")
+        # --legs alone names its file itself
+        if name != "legs" and getattr(options, name, None) == "":
+            raise UsageError(f"--{option} is empty: name what to write, or leave it out.")
         if name != "json" and getattr(options, name, None) == "-":
             raise UsageError(
                 f"--{option} is '-', and only --json writes to standard output: name a file."
             )
         for path in _paths(getattr(options, name, None)):
-            place = Path(path).resolve()
+            place = real_path(path)
             # a device takes everything
             if place in taken and (place.is_file() or not place.exists()):
                 raise UsageError(

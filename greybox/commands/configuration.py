@@ -13,11 +13,26 @@ from typing import Any
 from greybox.commands.common import OUTPUTS
 from greybox.commands.completion import VESSELS, endings
 from greybox.commands.parser import Parser, sub_parsers
-from greybox.errors import ConfigurationError, suggestion
+from greybox.errors import ConfigurationError, nearest, suggestion
 
 EVERYWHERE = "all"
+PREFIX = "GREYBOX_"
+VARIABLES = ("GREYBOX_CONFIG", "GREYBOX_CLUSTER")
 MOST_BYTES = 64_000
 _NEVER = ("--help", "--version", "--verbose", "--quiet", "--no-config")
+
+
+def require_known(environment: Mapping[str, str]) -> None:
+    """Raise where a variable has nearly the name of one that this program reads."""
+    for name in environment.keys() - {*VARIABLES}:
+        # the prefix that all share makes no names alike
+        word = name.removeprefix(PREFIX)
+        near = nearest(word, (v.removeprefix(PREFIX) for v in VARIABLES)) if word != name else ""
+        if near:
+            raise ConfigurationError(
+                f"the environment gives {name}, which no program reads. Did you mean "
+                f"'{PREFIX}{near}'? Correct or unset the variable."
+            )
 
 
 def find_configuration(folder: Path, environment: Mapping[str, str]) -> Path | None:
@@ -143,7 +158,7 @@ def _path(action: argparse.Action, text: str, where: str, folder: Path) -> str:
     target, output = folder / Path(text).expanduser(), action.dest in OUTPUTS
     if text == "-" if output else text in VESSELS and not target.exists():
         return text
-    if output and not target.resolve().is_relative_to(folder):
+    if output and not Path(os.path.realpath(target)).is_relative_to(folder):
         raise ConfigurationError(
             f"{where} is '{text}', outside the file's own folder: a configuration names outputs "
             f"in its folder only. Give this one on the command line."

@@ -12,8 +12,10 @@ from greybox.commands.common import (
     add_memory,
     add_outputs,
     add_seed,
+    by_name,
     configured,
     drawn,
+    is_named,
     leave_to_others,
     positive,
     progress,
@@ -254,7 +256,7 @@ def _pairs(texts: list[str], what: str) -> dict[str, tuple[float, float]]:
     """Read NAME=A:B."""
     from greybox.errors import UsageError
 
-    found = {}
+    found = []
     for text in texts:
         name, _, values = text.partition("=")
         try:
@@ -264,8 +266,8 @@ def _pairs(texts: list[str], what: str) -> dict[str, tuple[float, float]]:
                 f"--{what} '{text}' cannot be read: write NAME={_FORMS[what]}, such as "
                 f"{_EXAMPLES[what]}."
             ) from None
-        found[name] = (first, second)
-    return found
+        found.append((name, (first, second)))
+    return by_name(f"--{what}", found)
 
 
 # what other methods do not heed, by those that do
@@ -284,8 +286,8 @@ def _require_heeded(options: argparse.Namespace) -> None:
     add_arguments(parser)
     for methods, names in _ONLY.items():
         for name in names if options.method not in methods else ():
-            # measured is how it is done where nothing is asked for
-            if getattr(options, name) in (parser.get_default(name), "measured"):
+            # a measured heading is what a method without a choice takes
+            if not is_named(options, name) or (name, options.heading) == ("heading", "measured"):
                 continue
             option = f"--{name.replace('_', '-')}"
             only = f"{option} applies to --method {' and '.join(methods)} only"

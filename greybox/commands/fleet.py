@@ -44,14 +44,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _require_outside(options: argparse.Namespace) -> None:
     """Raise where an output would stand among the logs of a ship."""
-    from pathlib import Path
-
     from greybox.errors import UsageError
+    from greybox.files import real_path
 
-    fleet = Path(options.fleet).resolve()
+    fleet = real_path(options.fleet)
     for name in ("out", "json", "report"):
         path = getattr(options, name)
-        if path is not None and path != "-" and fleet in Path(path).resolve().parent.parents:
+        if path is not None and path != "-" and fleet in real_path(path).parent.parents:
             raise UsageError(
                 f"--{name} names '{path}' in the folder of a ship, where it would be taken for one "
                 f"of its files: name a file outside."

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from greybox.commands.common import (
     VESSEL_HELP,
+    by_name,
+    is_named,
     positive,
     progress,
     provenance,
@@ -206,6 +209,8 @@ def run(options: argparse.Namespace) -> None:
         say(summary)
         if (options.fix or options.fix_also) and "\nmended: " not in summary:
             say("mended: nothing, as the checks found nothing of what was to be mended")
+        for option in _idle(options, records):
+            say(f"note: {option} changed nothing, as {_NEEDS[option]}")
         for key in pairs(options.note, "--note"):
             if key not in UNITS and (near := suggestion(key, UNITS)):
                 say(f"note: '{key}' is kept in words, as no condition.{near}")
@@ -215,6 +220,26 @@ def run(options: argparse.Namespace) -> None:
         needed = ("psi", *vessel.commands)
         lacking = [c for c in needed if any(c not in r["units"] for r in records)]
         show_next([after_import(options.out, options.vessel, lacking)])
+
+
+# options of what many logs lack, with what was not there where nothing was done
+_NEEDS = {
+    "--velocities savgol": "no velocity was made from positions",
+    "--reference-height": "the log has no wind",
+    "--origin": "no position came from latitude and longitude",
+}
+
+
+def _idle(options: argparse.Namespace, records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the options that acted on no log."""
+    steps = {s["operation"] for r in records for s in r["steps"]}
+    idle = {
+        "--velocities savgol": options.velocities == "savgol" and "local_polynomials" not in steps,
+        "--reference-height": options.reference_height is not None
+        and not any("u_q" in r["units"] for r in records),
+        "--origin": options.origin is not None and "tangent_plane" not in steps,
+    }
+    return [option for option, unused in idle.items() if unused]
 
 
 def import_options(options: argparse.Namespace) -> ImportOptions:
@@ -227,7 +252,7 @@ def import_options(options: argparse.Namespace) -> ImportOptions:
         Conditions.read(notes := pairs(options.note, "--note"))
     except LogError as error:
         raise UsageError(f"--note: {error}") from None
-    if options.window != ImportOptions.window and options.velocities != "savgol":
+    if is_named(options, "window") and options.velocities != "savgol":
         raise UsageError(
             f"--window is {options.window:g} s, and --velocities {options.velocities} has none: "
             f"add --velocities savgol, or leave --window out."
@@ -269,15 +294,13 @@ def pairs(given: list[str], option: str, form: str = "KEY=TEXT") -> dict[str, st
     """
     from greybox.errors import UsageError
 
-    found: dict[str, str] = {}
+    found = []
     for item in given:
         key, sign, text = item.partition("=")
         if not key.strip() or not (sign or option == "--topic"):
             raise UsageError(f"{option} {item} has no value: write {option} {form}.")
-        if key.strip() in found:
-            raise UsageError(f"{option} gives '{key.strip()}' twice: keep one of them.")
-        found[key.strip()] = text.strip()
-    return found
+        found.append((key.strip(), text.strip()))
+    return by_name(option, found)
 
 
 def _origin(text: str | None) -> tuple[float, float] | None:

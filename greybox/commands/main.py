@@ -15,7 +15,7 @@ from pathlib import Path
 
 from greybox.commands.common import require_apart
 from greybox.commands.completion import offer
-from greybox.commands.configuration import configure, find_configuration
+from greybox.commands.configuration import configure, find_configuration, require_known
 from greybox.commands.parser import Parser, sub_parsers
 from greybox.commands.terminal import complain, telling
 from greybox.errors import GreyboxError, UsageError
@@ -101,6 +101,7 @@ def _parse(given: list[str]) -> argparse.Namespace:
             "the folder that this is run in was deleted, so paths lead nowhere: change to a "
             "folder that exists."
         ) from None
+    require_known(os.environ)
     unread = before.no_config or "no_config" in typed
     path = None if unread else find_configuration(folder, os.environ)
     more, record = configure(path, command, parsers, typed, build_parser) if path else ([], None)
@@ -108,6 +109,7 @@ def _parse(given: list[str]) -> argparse.Namespace:
     end = given.index("--") if "--" in given else len(given)
     options = parser.parse_args([*given[:end], *more, *given[end:]])
     options.typed, options.configuration = given, record
+    options.named = {*typed, *(record["options"] if record else ())}
     return options
 
 

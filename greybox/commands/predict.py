@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from greybox.commands.common import (
     add_outputs,
     add_seed,
+    by_name,
     count,
     drawn,
     positive,
@@ -217,8 +218,8 @@ def _angle(text: str) -> float | tuple[float, float]:
         values = []
     if len(values) not in (1, 2) or not all(0 < v < math.pi for v in values):
         raise UsageError(
-            f"--angle is '{text}': write degrees above 0, such as 35, or 20/10 for a zig-zag of "
-            f"20 degrees reversed at 10."
+            f"--angle is '{text}': write degrees between 0 and 180, such as 35, or 20/10 for a "
+            f"zig-zag of 20 degrees reversed at 10."
         )
     return values[0] if len(values) == 1 else (values[0], values[1])
 
@@ -229,19 +230,17 @@ def _command(texts: list[str]) -> float | dict[str, float] | None:
 
     if not texts:
         return None
-    named: dict[str, float] = {}
-    for text in texts:
-        name, _, value = text.rpartition("=")
-        try:
-            named[name.strip()] = float(value)
-        except ValueError:
-            named = {}
-            break
-    if not named or len(named) != len(texts) or ("" in named and len(named) > 1):
+    split = [text.rpartition("=") for text in texts]
+    try:
+        values = [(name.strip(), float(value)) for name, _, value in split]
+    except ValueError:
+        values = []
+    if not values or (len(values) > 1 and any(not name for name, _ in values)):
         raise UsageError(
             f"--command is '{' '.join(texts)}': write one number for all propellers, or NAME=N "
             f"each, such as n1=300 n2=300."
         )
+    named = by_name("--command", values)
     return named.get("", named)
 
 

@@ -12,6 +12,8 @@ from greybox.commands.common import (
     add_cluster,
     add_seed,
     at_least_one,
+    configured,
+    is_named,
     leave_to_others,
     positive,
     progress,
@@ -72,15 +74,16 @@ def _folder(path: str | None) -> Iterator[None]:
     """Make the folder before the study runs, and take it away where nothing came of it."""
     from greybox.files import make_folder
 
-    new = path is not None and not Path(path).exists()
+    new: list[Path] = []
     if path is not None:
+        new = [p for p in (Path(path), *Path(path).parents) if not p.exists()]
         make_folder(path)
     try:
         yield
     except BaseException:
-        if path is not None and new:
-            with suppress(OSError):
-                Path(path).rmdir()
+        with suppress(OSError):
+            for folder in new:
+                folder.rmdir()
         raise
 
 
@@ -156,6 +159,9 @@ def _run(options: argparse.Namespace) -> None:
         output = power_output(power, record)
     else:
         output = studies.chapter7_output(_chapter7(options, seen), record)
+        idle = ["runs", "workers", *(["seed"] if options.estimate else [])]
+        for name in (n for n in idle if is_named(options, n) and n not in configured(options)):
+            say(f"note: --{name} changed nothing, as chapter 7 draws nothing of what it was given")
     say(output.text)
     if options.out:
         studies.write_output(output, options.out)

@@ -64,9 +64,9 @@ def run(options: argparse.Namespace) -> None:
             values = [float(v) for v in options.start.split(",")]
         except ValueError:
             values = []
-        if len(values) != 4:
+        if len(values) != 4 or not np.isfinite(values).all():
             raise UsageError(
-                f"--start is '{options.start}', four numbers are needed: u,v,r,psi such as "
+                f"--start is '{options.start}', four finite numbers are needed: u,v,r,psi such as "
                 f"1.5,1.2,0,0."
             )
         fill = dict(zip(("u", "v", "r", "psi"), values, strict=True))
@@ -81,6 +81,11 @@ def run(options: argparse.Namespace) -> None:
         raise UsageError(
             f"--start is '{options.start}', and '{path}' holds u, v, r and psi from which "
             f"its run starts: leave --start out, or name a log of commands only."
+        )
+    if fill and options.heading == "measured" and np.all(log["psi"] == fill["psi"]):
+        raise UsageError(
+            f"--heading is measured, and '{path}' holds no heading that changes: leave --heading "
+            f"out, or name a log with psi."
         )
     heading: Literal["measured", "simulated"] = options.heading or (
         "simulated" if fill else "measured"

@@ -119,6 +119,11 @@ def export_model(
         raise UsageError(f"only an FMU holds a binary, '{to}' does not: leave --no-binary out.")
     if str(out) == "-":
         raise UsageError(f"'{to}' is written to a file: name one instead of '-'.")
+    idle: tuple[str, ...] = ()
+    if settled and not model.changes:
+        idle = ("settled changed nothing, as no parameter of the model changes",)
+    if wind is not None and not model.structure.uses_air:
+        idle = (*idle, f"wind = '{wind}' changed nothing, as the model has no wind terms")
     model = model.at_final_parameters() if settled else model
     path = Path(out)
     if path.suffix.casefold() in {f".{t}" for t in TARGETS} - {f".{to}"}:
@@ -147,7 +152,7 @@ def export_model(
         tuple(files),
         tuple(f"{p.name} [{p.shown_unit}]" for p in sampled.inputs),
         tuple(f"{p.name} [{p.shown_unit}]" for p in sampled.outputs),
-        (*notes, *sampled.notes),
+        (*idle, *notes, *sampled.notes),
     )
 
 

@@ -398,10 +398,19 @@ def _client(address: str) -> Client:
         return known
     try:
         from distributed import Client
+        from distributed.comm import get_address_host_port
     except ImportError as error:
         raise UsageError(
             "a cluster needs dask.distributed: pip install 'greybox-marine[dask]'."
         ) from error
+    try:
+        # a client that cannot read its address stays half made, and fails again as it is dropped
+        get_address_host_port(address)
+    except ValueError:
+        raise ClusterError(
+            f"'{address}' is no address of a Dask scheduler, which names a host and a port: give "
+            f"--cluster, or {ENVIRONMENT}, one such as tcp://host:8786."
+        ) from None
     for name in _LOGGERS:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:

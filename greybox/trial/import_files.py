@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from greybox.errors import LogError
-from greybox.files import check_targets
+from greybox.files import check_targets, real_path
 from greybox.trial.checks.actuators import measure_actuators
 from greybox.trial.checks.check import check_recordings
 from greybox.trial.checks.signal_quality import angle_unit_findings
@@ -242,7 +242,7 @@ def _write(
 
 def _keep_source(path: str | Path, logs: Sequence[Path]) -> None:
     """Refuse to write a log over a raw file: it could not be imported again."""
-    if Path(path).resolve() in {p.resolve() for log in logs for p in (log, record_path(log))}:
+    if real_path(path) in {real_path(p) for log in logs for p in (log, record_path(log))}:
         raise LogError(
             f"'{Path(path).name}' is also the log to write: name another file for the log."
         )

@@ -119,8 +119,13 @@ def test_a_plan_of_commands_is_simulated_from_a_start(noisy_csv, tmp_path, capsy
     assert "cannot be derived" in error
     assert error.endswith("; commands alone are simulated with --start.\n")
     assert run("simulate", model, plan, "--start", "1.5,1.2,0,0", "--out", tmp_path / "r.csv") == 0
-    assert run("simulate", model, plan, "--start", "1.5,1.2", "--out", tmp_path / "r.csv") == 1
-    assert "four numbers are needed" in capsys.readouterr().err
+    for start in ("1.5,1.2", "1.5,1.2,0,nan", "inf,1.2,0,0"):
+        assert run("simulate", model, plan, "--start", start, "--out", tmp_path / "n.csv") == 1
+        assert "four finite numbers are needed" in capsys.readouterr().err
+    held = ["--start", "1.5,1.2,0,0", "--heading", "measured", "--out", tmp_path / "n.csv"]
+    assert run("simulate", model, plan, *held) == 1
+    assert "holds no heading that changes: leave --heading out" in capsys.readouterr().err
+    assert not (tmp_path / "n.csv").exists()
     given = ["simulate", model, noisy_csv, "--start", "1.5,1.2,0,0.5"]
     assert run(*given, "--out", tmp_path / "none.csv") == 1
     assert "leave --start out, or name a log of commands only." in capsys.readouterr().err
@@ -166,6 +171,36 @@ def test_a_plan_of_commands_is_simulated_from_a_start(noisy_csv, tmp_path, capsy
         (["check", "{log}", "--vessel", ""], "a file of vessel has an empty name"),
         (["check", "{log}", "--vessel", "thesis", "--report", "-"], "only --json writes to"),
         (["reproduce", "chapter7", "--estimate", "x"], "together"),
+        (["reproduce", "chapter4", "--out", ""], "--out is empty: name what to write"),
+        (["demo", "--out", ""], "--out is empty: name what to write"),
+        (["estimate", "{log}", "--vessel", "thesis", "--json", ""], "--json is empty: name what"),
+        (
+            [
+                "estimate",
+                "{log}",
+                "--vessel",
+                "thesis",
+                "--bound",
+                "Xu=0:1",
+                "Xu=0:2",
+                "--method",
+                "oe",
+            ],
+            "--bound gives 'Xu' twice: keep one of them.",
+        ),
+        # what is named as its default is asked for all the same
+        (
+            ["estimate", "{log}", "--vessel", "thesis", "--method", "ls", "--loss", "gaussian"],
+            "--loss applies to --method oe only",
+        ),
+        (
+            ["estimate", "{log}", "--vessel", "thesis", "--method", "iv", "--wind", "measured"],
+            "--wind applies to --method oe only",
+        ),
+        (
+            ["import", "{log}", "--vessel", "thesis", "--out", "x.csv", "--window", "2"],
+            "--velocities central has none",
+        ),
     ],
 )
 def test_input_at_fault_is_one_sentence(noisy_csv, capsys, arguments, message):
@@ -177,9 +212,19 @@ def test_input_at_fault_is_one_sentence(noisy_csv, capsys, arguments, message):
     assert "Traceback" not in error
 
 
+def test_a_link_that_leads_round_is_no_file(tmp_path, capsys):
+    loop = tmp_path / "loop.csv"
+    loop.symlink_to(loop)
+    for given in (["check", loop], ["estimate", loop], ["import", loop, "--out", loop]):
+        assert run(*given, "--vessel", "thesis") == 1
+        error = capsys.readouterr().err
+        assert "loop.csv" in error
+        assert error.count("\n") == 1
+
+
 def test_a_folder_of_a_study_that_came_to_nothing_is_taken_away(noisy_csv, tmp_path):
     given = ["--estimate", noisy_csv, "--validate", noisy_csv, "--vessel", "thesis"]
-    assert run("reproduce", "chapter7", *given, "--out", tmp_path / "c7") == 1
+    assert run("reproduce", "chapter7", *given, "--out", tmp_path / "c7" / "of" / "today") == 1
     assert not (tmp_path / "c7").exists()
 
 
@@ -258,8 +303,10 @@ def test_reproduce_chapter7_on_logs(tmp_path, capsys):
         log = virtual_log(30 + i, 500, wind=3.0 if i < 2 else 0.5, name=f"day{i}")
         files.append(write_csv(log, tmp_path / f"day{i}.csv"))
     assert run("reproduce", "chapter7", "--vessel", "thesis", "--estimate", *files[:2],
-               "--validate", files[2], "--out", tmp_path / "c7") == 0  # fmt: skip
-    assert "estimation sets: 2 of 1 logs" in capsys.readouterr().out
+               "--validate", files[2], "--runs", "5", "--out", tmp_path / "c7") == 0  # fmt: skip
+    told = capsys.readouterr().out
+    assert "estimation sets: 2 of 1 logs" in told
+    assert "note: --runs changed nothing" in told
     assert (tmp_path / "c7" / "table_7.1.png").exists()
 
 

@@ -147,6 +147,18 @@ def test_the_variable_names_another_file(folder, options, monkeypatch, capsys):
     assert "GREYBOX_CONFIG names 'none.toml', which is no file" in capsys.readouterr().err
 
 
+def test_a_mistyped_variable_is_told(folder, options, monkeypatch, capsys):
+    monkeypatch.setenv("GREYBOX_DATA", "logs")
+    given = ("check", "trial.csv", "--vessel", "ship.toml")
+    assert options(*given).vessel == "ship.toml"
+    monkeypatch.setenv("GREYBOX_CONFG", "my.toml")
+    assert options(*given) == 1
+    assert capsys.readouterr().err == (
+        "greybox: the environment gives GREYBOX_CONFG, which no program reads. Did you mean "
+        "'GREYBOX_CONFIG'? Correct or unset the variable.\n"
+    )
+
+
 def test_where_the_file_is_looked_for(tmp_path):
     home, inner = tmp_path / "home", tmp_path / "home" / "work" / "trial"
     inner.mkdir(parents=True)

@@ -313,6 +313,22 @@ def test_numbers_that_cannot_be_are_wrong_usage(folder, options):
     assert stop.value.code == 2
 
 
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        (["--end", "u=1.5", "u=1.6"], "u"),
+        (["--envelope", "n=12:14", "n=14:16"], "n"),
+        (["--for", "coefficients", "--target", "Yvv=1", "Yvv=2"], "Yvv"),
+    ],
+)
+def test_a_name_that_stands_twice_is_refused(folder, capsys, options, name):
+    status, plan = run(folder, "--duration", "100", *options)
+    assert status == 1
+    option = next(o for o in options[::-1] if o.startswith("--"))
+    assert f"{option} gives '{name}' twice: keep one of them." in capsys.readouterr().err
+    assert not plan.exists()
+
+
 def test_wrong_usage(folder):
     with pytest.raises(SystemExit) as stop:
         run(folder, "--duration", "-5")

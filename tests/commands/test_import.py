@@ -399,6 +399,23 @@ def test_a_log_that_is_imported_again_is_the_same(tmp_path, capsys, monkeypatch,
     assert records[0]["conditions"] == {"draught": 1.2}
 
 
+def test_an_option_that_acted_on_nothing_is_told(tmp_path, capsys):
+    raw, out = tmp_path / "raw.csv", tmp_path / "log.csv"
+    table = data(300).drop(columns=["u_q", "v_q"])
+    options = ("--velocities", "savgol", "--window", "5", "--origin", "58,15")
+    table.to_csv(raw, index=False)
+    given = ("import", raw, "--vessel", "thesis", "--out", out, *options)
+    status, said, _ = run(capsys, *given, "--reference-height", "10")
+    assert status == 0
+    assert "note: --velocities savgol changed nothing, as no velocity was made from" in said
+    assert "note: --origin changed nothing, as no position came from latitude and" in said
+    assert "note: --reference-height changed nothing, as the log has no wind" in said
+    # a window for a channel of its own makes no velocity
+    assert "note: --velocities savgol" in run(capsys, *given, "--smooth", "r=6")[1]
+    table.drop(columns=["u", "v"]).to_csv(raw, index=False)
+    assert "note: --velocities savgol" not in run(capsys, *given)[1]
+
+
 def test_a_height_is_changed_from_that_of_the_log(tmp_path, capsys):
     ship = tmp_path / "ship.toml"
     ship.write_text(MAST_SHIP)

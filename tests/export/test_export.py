@@ -105,6 +105,8 @@ def test_settled_is_the_model_after_its_changes(model, tmp_path):
     assert any("Xu is 3 times its value from 40 s on" in n for n in exported.notes)
     exported = export_model(changing, "json", tmp_path / "b.json", settled=True)
     assert exported.notes == ()
+    exported = export_model(model, "json", tmp_path / "c.json", settled=True)
+    assert exported.notes == ("settled changed nothing, as no parameter of the model changes",)
     table = json.loads((tmp_path / "b.json").read_text())
     assert table["parameters"][0]["value"] == pytest.approx(1.5 * model.theta[0])
     assert table["changes"] == []

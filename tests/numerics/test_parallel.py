@@ -329,6 +329,17 @@ def test_a_scheduler_that_is_not_there_is_one_sentence(tmp_path, capsys, monkeyp
     )
 
 
+@pytest.mark.parametrize("address", ["somewhere", "tcp://host", "http://host:8786", "tcp://host:a"])
+def test_what_is_no_address_is_refused_at_once(address):
+    """A client that is made of it waits, and leaves a traceback behind the sentence."""
+    pytest.importorskip("distributed")
+    with (
+        pytest.raises(ClusterError, match=f"^'{address}' is no address of a Dask scheduler, "),
+        on_cluster(address),
+    ):
+        pass
+
+
 def test_what_no_worker_is_left_to_make_is_not_waited_for(monkeypatch):
     monkeypatch.setattr("greybox.numerics.parallel._LOOK", 0.01)
     ended: list[dict] = []

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from greybox.errors import LogError, UsageError
+from greybox.files import real_path
 from greybox.numerics.parallel import map_forked
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.checks.actuators import measure_actuators
@@ -112,7 +113,7 @@ def require_each_once(paths: Sequence[str | Path]) -> None:
     UsageError
         Names the file.
     """
-    places = [Path(path).resolve() for path in paths]
+    places = [real_path(path) for path in paths]
     twice = next((p for p in places if places.count(p) > 1), None)
     if twice is not None:
         raise UsageError(
