@@ -348,11 +348,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def stages(options: argparse.Namespace) -> list[Stage]:
     """Return the shares of the time that each stage usually takes."""
     if _purpose(options, _given(options)).whole:
-        search = [("read model", 15.0), ("settings are exchanged", 60.0)]
+        search = [("read model", 12.0), ("settings are exchanged", 60.0 * options.effort)]
     else:
         shortest = [("duration", 150.0)] if options.target else []
-        search = [("read model", 40.0), *shortest, ("design:", 60.0), ("solved", 10.0)]
-    return [("", 5.0), *search, *drawn(options, 8.0)]
+        search = [("read model", 20.0), *shortest, ("design:", 36.0 * options.effort)]
+        search = [*search, ("solved", 10.0)]
+    return [("", 1.0), *search, *drawn(options, 8.0)]
 
 
 def run(options: argparse.Namespace) -> None:
@@ -794,7 +795,7 @@ def _asked(options: argparse.Namespace, model: Any, sailed: Any = None) -> Any:
     return DesignRequest(
         duration=_duration(options),
         hold=options.hold,
-        regime=options.regime or "auto",
+        regime="auto" if options.regime is None else options.regime,
         start=options.start,
         trials=options.trials,
         predictor=options.predictor,
@@ -882,7 +883,24 @@ def read_area(path: str | Path) -> Any:
             f"the sea room '{path.name}' has {len(corners)} corners, 3 to 500 finite ones are "
             f"needed."
         )
+    if _crosses_itself(corners):
+        raise LogError(
+            f"the edge of the sea room '{path.name}' crosses itself: name its {len(corners)} "
+            f"corners in their order round it."
+        )
     return corners
+
+
+def _crosses_itself(corners: Any) -> bool:
+    """Return whether two edges of a polygon (m, 2) cross."""
+    import numpy as np
+
+    begin, along = corners, np.roll(corners, -1, axis=0) - corners
+    off = begin[None] - begin[:, None]
+    # on which side of each edge each corner lies
+    side = along[:, None, 0] * off[..., 1] - along[:, None, 1] * off[..., 0]
+    parted = side * np.roll(side, -1, axis=1) < 0
+    return bool((parted & parted.T).any())
 
 
 PURPOSES: Registry[Purpose] = Registry(

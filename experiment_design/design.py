@@ -64,6 +64,7 @@ Array = NDArray[np.float64]
 _NEAR, _POLISH, _PATIENCE = 0.1, 40, 3600.0
 # how a design ended that keeps not all of its limits
 CLOSEST = "limits not kept: the closest plan that was found"
+STOPPED = "stopped by the user: the best plan found so far"
 
 _log = logging.getLogger(__name__)
 
@@ -206,7 +207,7 @@ def design_trial(
             stopped = True
     design = described(
         request, problems, units, reference, kept, certificate=certificate, keeping=keeping,
-        status="stopped by the user: the best plan found so far" if stopped else status,
+        status=STOPPED if stopped else status,
         notes=tuple(notes), evaluations=evaluations, began=began,
     )  # fmt: skip
     if not alternatives or request.trials > 1 or stopped:

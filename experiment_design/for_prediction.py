@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from experiment_design.after import log_moments
 from experiment_design.certificate.certificate import absent
+from experiment_design.constraints.kinds.sea_room import SeaRoom
 from experiment_design.constraints.limits import TOLERANCE, Circumstances, Limit
 from experiment_design.design import CLOSEST, described
 from experiment_design.excitation.rollout import Motion
-from experiment_design.feasibility.checks import require_horizon, smallest_circle
+from experiment_design.feasibility.checks import require_horizon, require_start, smallest_circle
 from experiment_design.feasibility.constraint_satisfaction import (
     ConstraintSatisfaction,
     keeps_start,
@@ -692,6 +693,8 @@ def _campaign(
     known = before
     for trial in range(request.trials):
         problem = build_problem(request, trial)
+        # no command leads into a room from a start outside it, and a search would take minutes
+        require_start(problem, request, trial, SeaRoom.name)
         search = search_envelope(
             problem, envelope, request.seed + 1000 * trial, request.effort, known, workers
         )

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def stages(options: argparse.Namespace) -> list[Stage]:
     """Return the shares of the time that each stage usually takes."""
     return [
-        ("", 4.0), ("designing the first trial", 21.0), ("sailing", 3.0), ("checking the log", 3.0),
+        ("", 1.0), ("designing the first trial", 21.0), ("sailing", 3.0), ("checking the log", 3.0),
         ("estimating", 2.0), ("log checks", 8.0), ("model without causes", 6.0),
         ("designing the next trial", 28.0), ("drawing the page", 10.0),
     ]  # fmt: skip

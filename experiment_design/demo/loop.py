@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from experiment_design.constraints.limits import TrialLimits
 from experiment_design.demo.steps import Demo, Files, Step
-from experiment_design.design import design_trial
+from experiment_design.design import STOPPED, design_trial
 from experiment_design.output.result import Design, write_plan
 from experiment_design.prepare import prepare_request
 from experiment_design.request.request import DesignRequest
@@ -103,7 +103,7 @@ def run_demo(
     prior = prior_model()
     prior.save(files.prior)
     progress("designing the first trial")
-    design = design_trial(prepare_request(prior, _asked(_SECONDS, seed)), alternatives=False)
+    design = _design(prior, _asked(_SECONDS, seed))
     write_plan(design, files.plan)
     done(_designed(design))
 
@@ -144,13 +144,21 @@ def run_demo(
 
     progress("designing the next trial")
     asked = _asked(_NEXT_SECONDS, seed, prior=better)
-    next_design = design_trial(prepare_request(better, asked), alternatives=False)
+    next_design = _design(better, asked)
     write_plan(next_design, files.next_plan)
     done(_designed_next(next_design, better))
     return Demo(
         files, tuple(steps), design, next_design, trial, other, sailed.truth, check, estimate,
         before, after, gain, diagnosis,
     )  # fmt: skip
+
+
+def _design(model: ManoeuvringModel, asked: DesignRequest) -> Design:
+    """Design a trial; Ctrl-C, which ends a search with the best so far, ends the loop."""
+    design = design_trial(prepare_request(model, asked), alternatives=False)
+    if design.status == STOPPED:
+        raise KeyboardInterrupt
+    return design
 
 
 def _run_on(path: Path, models: Mapping[str, ManoeuvringModel]) -> Comparison:

@@ -136,12 +136,14 @@ def missed_targets(
     ]
 
 
-def require_start(problem: TrialProblem, request: PreparedRequest, trial: int) -> None:
-    """Raise where the start itself breaks a limit."""
+def require_start(
+    problem: TrialProblem, request: PreparedRequest, trial: int, only: str = ""
+) -> None:
+    """Raise where the start itself breaks a limit, or the one of that name only."""
     program = problem.scenarios[0].limits
     missed = problem.missed_at_start(request.starts[trial])
     for limit, m, more in zip(program.path_limits, missed, program.backoff, strict=True):
-        if m - more > TOLERANCE:
+        if m - more > TOLERANCE and only in ("", limit.name):
             raise InfeasibleError(limit.start_advice(float(m)))
 
 

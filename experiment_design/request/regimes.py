@@ -102,6 +102,8 @@ def parse_regime(text: str, states: tuple[str, ...]) -> Signs:
     """
     signs: list[tuple[str, int]] = []
     rest = text.replace(" ", "")
+    if not rest:
+        raise UsageError("the regime is empty: write states and signs such as u+v+, or auto.")
     while rest:
         if len(rest) < 2 or rest[1] not in "+-":
             raise UsageError(

@@ -95,11 +95,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def stages(options: argparse.Namespace) -> list[Stage]:
     """Return the shares of the time that each stage usually takes."""
-    of_terms = [] if options.model else [("terms that the data choose", 25.0)]
+    of_terms = [] if options.model else [("terms that the data choose", 15.0)]
     return [
-        ("", 5.0), ("samples of", 4.0), ("axes", 15.0), ("model without causes", 25.0),
-        ("step 1", 9.0), ("a generic force", 4.0), *of_terms, ("what is left", 1.0),
-        ("gain", 12.0), *drawn(options, 18.0),
+        ("", 8.0), ("samples of", 5.0), ("axes", 30.0), ("model without causes", 28.0),
+        ("step 1", 6.0), ("a generic force", 6.0), *of_terms, ("what is left", 1.0),
+        ("gain", 10.0), *drawn(options, 30.0),
     ]  # fmt: skip
 
 

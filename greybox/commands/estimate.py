@@ -356,8 +356,8 @@ def stages(options: argparse.Namespace) -> list[Stage]:
         ("selection of terms", not (options.method or options.predictor or options.structure)),
     )
     return [
-        ("", 15.0), ("ways to estimate", 20.0),
-        *((words, 60.0) for words, made in searches if made),
+        ("", 5.0), ("ways to estimate", 25.0),
+        *((words, 50.0) for words, made in searches if made),
         ("verdict on predictions", 6.0), *drawn(options, 25.0),
     ]  # fmt: skip
 
@@ -389,6 +389,13 @@ def run(options: argparse.Namespace) -> None:
     # the vessel's own terms may be changed too: here only the states matter
     named = options.structure or (options.compare_structures or ["thesis"])[0]
     states = get_structure(named.split("+")[0].split("-")[0]).states
+    for name in ("u", "v"):
+        given, needless = getattr(options, f"margin_{name}"), name not in states
+        if needless and given is not None and not leave_to_others(options, f"margin_{name}", None):
+            raise UsageError(
+                f"--margin-{name} cuts out samples by {name}, which structure '{named}' has not: "
+                f"leave it out."
+            )
     files = find_logs(options.logs)
     rows = estimated_rows(files)
     streams = rows * BYTES > options.memory * 2**30

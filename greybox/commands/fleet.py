@@ -59,7 +59,7 @@ def _require_outside(options: argparse.Namespace) -> None:
 
 def stages(options: argparse.Namespace) -> list[Stage]:
     """Return the shares of the time that each stage usually takes."""
-    return [("", 10.0), ("ships", 80.0), *drawn(options, 10.0)]
+    return [("", 35.0), ("ships", 45.0), *drawn(options, 20.0)]
 
 
 def run(options: argparse.Namespace) -> None:

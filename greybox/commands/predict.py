@@ -137,7 +137,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def stages(options: argparse.Namespace) -> list[Stage]:
     """Return the shares of the time that each stage usually takes."""
-    return [("", 8.0), ("manoeuvres", 75.0), *drawn(options, 20.0)]
+    return [("", 1.0), ("manoeuvres", 75.0), *drawn(options, 20.0)]
 
 
 def run(options: argparse.Namespace) -> None:
@@ -145,6 +145,7 @@ def run(options: argparse.Namespace) -> None:
     import math
     from dataclasses import replace
 
+    from greybox.errors import UsageError
     from greybox.files import check_targets
     from greybox.model.model import load_model
     from greybox.prediction.predict import predict_manoeuvre
@@ -154,6 +155,8 @@ def run(options: argparse.Namespace) -> None:
     if options.out:
         require_log_ending(options.out)
     check_targets(options.json, options.report, options.out)
+    if not math.isfinite(options.course):
+        raise UsageError(f"--course is {options.course:g}, a finite number of degrees is needed.")
     angles = [_angle(text) for text in options.angle]
     command = _command(options.propellers)
     model = load_model(options.model)

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from typing import Literal
+import logging
+from typing import TYPE_CHECKING, Literal
 
 from greybox.commands.common import add_seed, require_ending, say
 
+if TYPE_CHECKING:
+    from greybox.commands.time_left import Stage
+
+_log = logging.getLogger(__name__)
 HELP = "run a model freely on the inputs of a log"
 EXAMPLES = """examples:
   greybox simulate model.json trial.csv --out run.csv
@@ -36,6 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="leave out the band that holds the motion with 95 %% probability",
     )
     add_seed(parser)
+
+
+def stages(options: argparse.Namespace) -> list[Stage]:
+    """Return the shares of the time that each stage usually takes."""
+    return [("", 10.0), *([] if options.no_bands else [("bands", 70.0)]), ("units", 45.0)]
 
 
 def run(options: argparse.Namespace) -> None:
@@ -113,6 +123,7 @@ def run(options: argparse.Namespace) -> None:
         columns |= dict(zip(("x_n", "y_n"), np.concatenate(track).T, strict=True))
     notes: tuple[str, ...] = ()
     if not options.no_bands:
+        _log.info("bands about the free run")
         bands = predict_bands(model, result.log, heading=heading, seed=options.seed)
         notes = bands.notes
         for i, state in enumerate(states):
@@ -132,6 +143,7 @@ def run(options: argparse.Namespace) -> None:
         say(f"note: {', '.join(winds)} act as in still air, because the log has no wind")
     gaps = (g.sentence for g in find_log_gaps(result.log))
     others = (d.sentence for d in other_conditions(model.conditions, [log]))
+    _log.info("units, frames and signs of the columns")
     for note in (*misnamed_columns([path], model.vessel), *gaps, *notes, *others):
         say(f"note: {note}")
     if not fill:

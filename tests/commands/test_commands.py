@@ -188,6 +188,11 @@ def test_a_plan_of_commands_is_simulated_from_a_start(noisy_csv, tmp_path, capsy
             ],
             "--bound gives 'Xu' twice: keep one of them.",
         ),
+        (
+            ["estimate", "{log}", "--vessel", "thesis", "--structure", "surge", "--margin-v", "1"],
+            "--margin-v cuts out samples by v, which structure 'surge' has not",
+        ),
+        (["predict", "m.json", "turning", "--course", "nan"], "--course is nan, a finite number"),
         # what is named as its default is asked for all the same
         (
             ["estimate", "{log}", "--vessel", "thesis", "--method", "ls", "--loss", "gaussian"],

@@ -329,6 +329,32 @@ def test_a_name_that_stands_twice_is_refused(folder, capsys, options, name):
     assert not plan.exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--circle", "0,0,300", "--position", "900,0"], "starts 600.0 m outside the sea room"),
+        (["--circle", "0,0,300", "--clearance", "400"], "starts 100.0 m short of the clearance"),
+        (["--area", "{crossing}"], "crosses itself: name its 4 corners in their order round it"),
+        (["--regime", ""], "the regime is empty"),
+        (["--end", "u=nan"], "both must be finite"),
+    ],
+)
+def test_a_trial_that_cannot_begin_is_told_before_any_search(
+    folder, tmp_path, monkeypatch, capsys, options, message
+):
+    def search(*given, **named):
+        pytest.fail("it is searched for")
+
+    monkeypatch.setattr("experiment_design.for_prediction.search_envelope", search)
+    crossing = tmp_path / "crossing.csv"
+    crossing.write_text("x_n,y_n\n0,0\n400,400\n400,0\n0,400\n")
+    given = [o.replace("{crossing}", str(crossing)) for o in options]
+    status, plan = run(folder, "--duration", "100", *given)
+    assert status == 1
+    assert message in capsys.readouterr().err
+    assert not plan.exists()
+
+
 def test_wrong_usage(folder):
     with pytest.raises(SystemExit) as stop:
         run(folder, "--duration", "-5")

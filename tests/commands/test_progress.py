@@ -145,6 +145,16 @@ def test_the_time_left_follows_the_usual_shares_of_stages() -> None:
     assert left.share() == pytest.approx(0.7)
 
 
+def test_to_start_up_is_no_part_of_the_first_stage() -> None:
+    clock = Clock()
+    left = TimeLeft([("reading", 5.0), ("samples", 95.0)], clock)
+    clock.now = 2.0
+    left.tell("reading logs: 0 of 2", 0, 2)
+    clock.now = 3.0
+    left.tell("samples of 2 logs")
+    assert left.seconds() == pytest.approx(19.0)
+
+
 def test_a_stage_that_never_came_takes_no_time() -> None:
     clock = Clock()
     left = TimeLeft([("", 10.0), ("terms", 50.0), ("gain", 10.0)], clock)

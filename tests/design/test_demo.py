@@ -49,6 +49,19 @@ def test_unknown_effects_are_named_with_those_that_exist(tmp_path, capsys):
     assert "thruster_lag" in EFFECTS
 
 
+def test_ctrl_c_in_a_search_ends_the_loop(tmp_path, monkeypatch):
+    """A search that is stopped gives the best plan so far, on which the demo would go on."""
+
+    def stopped(*given, **named):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("experiment_design.demo.loop._EFFORT", 0.02)
+    monkeypatch.setattr("experiment_design.design.certify", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run_demo(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["prior.json"]
+
+
 def test_its_headline_names_effects_by_their_titles():
     lag = SimpleNamespace(id="thruster_lag", title="slow thrusters")
     bias = SimpleNamespace(id="heading_bias", title="compass bias")

@@ -74,6 +74,11 @@ class SeaRoom(PathLimit):
 
     def start_advice(self, missed: float) -> str:
         """Return why a trial cannot start where it does."""
+        if self.bound:
+            return (
+                f"the trial starts {missed:.1f} m short of the clearance of {self.bound:g} m from "
+                f"the edge of the sea room: move it by --position, or lower --clearance."
+            )
         return (
             f"the trial starts {missed:.1f} m outside the sea room: move it by --position, or the "
             f"sea room."

@@ -93,8 +93,9 @@ class EndState(WholeLimit):
                 )
             if not (np.isfinite(value) and 0 < tolerance < np.inf):
                 raise UsageError(
-                    f"the end state {name} = {value:g} has the tolerance {tolerance:g}, it must be "
-                    f"positive: write --end {name}=VALUE:TOLERANCE."
+                    f"the end state {name} = {value:g} has the tolerance {tolerance:g}: both "
+                    f"must be finite, and the tolerance positive. Write --end "
+                    f"{name}=VALUE:TOLERANCE."
                 )
             shift = dict(zip(("x_n", "y_n"), limits.position, strict=True)).get(name, 0.0)
             place = trial.signals.index(name)
