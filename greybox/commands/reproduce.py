@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -24,6 +25,7 @@ from greybox.commands.common import (
 if TYPE_CHECKING:
     from greybox.study.chapter7 import Chapter7
 
+_log = logging.getLogger(__name__)
 HELP = "repeat the studies of the thesis, of the estimators' efficiency and of the diagnosis' power"
 EXAMPLES = """examples:
   greybox reproduce chapter4 --out chapter4
@@ -116,7 +118,10 @@ def _run(options: argparse.Namespace) -> None:
     from greybox.report import studies
 
     record, study = provenance(options), options.study
-    seen = progress(study.replace("chapter", "chapter "))
+    title = study.replace("chapter", "chapter ")
+    # the first runs may take long, and are counted when they are done
+    _log.info("%s: first runs", title)
+    seen = progress(title)
     if study == "chapter4":
         from greybox.study.chapter4 import reproduce_chapter4
 
