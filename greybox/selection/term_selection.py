@@ -30,7 +30,7 @@ from greybox.selection.free_run_selection import FreeRunSelection, Selected
 from greybox.selection.held_out import extent, folds, rank, spread_of
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
-from greybox.validation.held_commands import held_bounds, held_commands
+from greybox.validation.held_commands import held_bounds, held_commands, known_bounds
 from greybox.vessel.force import force_inputs
 from greybox.vessel.thrust import ThrustLaw, typical_speed
 from greybox.vessel.vessel import Between
@@ -465,7 +465,7 @@ def _staying(
 
     Beside it how many that were preferred do not. Terms may follow all parts of a log and drive
     the ship where it never stayed. The first choice stands where none stays that is better than
-    the present model.
+    the present model; of those that stay one is preferred that stays near motions of the logs.
 
     Parameters
     ----------
@@ -482,17 +482,16 @@ def _staying(
     if not chosen or not held:
         return chosen, 0
     runs = FreeRunSelection(held, structure, kind)
-    bounds = held_bounds(logs, structure.states)
     left: list[Array | None] = [*scores]
-    now = chosen
-    while now:
-        found = sets[now - 1]
-        assert found is not None
-        if not runs.escapes(found.p, bounds):
-            return now, len(left) - sum(s is not None for s in left)
-        left[now] = None
-        now = rank(left, preferred, given_away=_GIVEN_AWAY).chosen
-    return chosen, 0
+    now, taken, passed = chosen, chosen, 0
+    for bounds in (held_bounds(logs, structure.states), known_bounds(logs, structure.states)):
+        while now and (found := sets[now - 1]) is not None and runs.escapes(found.p, bounds):
+            left[now] = None
+            now = rank(left, preferred, given_away=_GIVEN_AWAY).chosen
+        if not now:
+            break
+        taken, passed = now, sum(s is None for s in left)
+    return taken, passed
 
 
 def _error(sets: Sequence[Selected], size: int) -> float:

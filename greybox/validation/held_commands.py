@@ -17,7 +17,7 @@ from greybox.estimation.prediction_verdict import LIMITS, HeldCommandsDiverge, S
 from greybox.model.model import ManoeuvringModel
 from greybox.regression.instruments import state_bound
 from greybox.trial.log import TrialLog
-from greybox.trial.validity import settings_of
+from greybox.trial.validity import ranges, settings_of
 from greybox.validation.fit import run_model
 
 Array = NDArray[np.float64]
@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 # astern that pushes ahead. Models of a 7 m tanker and a 105 m ship that did so at 0.08 to 0.19 of
 # that speed had fits of surge of -32 to 88 % on other manoeuvres, for which 80 to 93 % are usual
 _ASTERN = 0.05
+# times what the logs showed that held commands may reach: steady turns go beyond short ones, by 1.0
+# to 1.4 times in models that follow other manoeuvres, by 1.5 to 2.6 times in those that do not
+_BEYOND = 1.5
 
 
 def held_commands_diverge(
@@ -84,6 +87,14 @@ def held_bounds(logs: Sequence[TrialLog], states: Sequence[str]) -> tuple[Array,
         if pushes >= 0 and min(u.min(initial=0.0) for u in seen) > slowest:
             least[list(states).index("u")] = slowest
     return least, most
+
+
+def known_bounds(logs: Sequence[TrialLog], states: Sequence[str]) -> tuple[Array, Array]:
+    """Return the least and the greatest states (nx,) near what the logs showed, to both sides."""
+    least, _ = held_bounds(logs, states)
+    seen = ranges(logs, states)
+    most = _BEYOND * np.array([max(abs(a), abs(b)) for a, b in (seen[s] for s in states)])
+    return np.maximum(least, -most), most
 
 
 def held_commands(logs: Sequence[TrialLog]) -> list[TrialLog]:
