@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import shutil
+import tomllib
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from foreign_ships import manoeuvres, presets
 from virtual import as_recording, recorded
 
 from greybox.errors import LogError, UsageError
@@ -16,6 +18,7 @@ from greybox.trial.checks.finding import IDS, exact_finding, factor_of
 from greybox.trial.checks.thruster_response import answer_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.convert import import_recording
+from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs, repair
 from greybox.trial.steps import mend
@@ -265,6 +268,72 @@ def test_without_a_course_heading_and_rate_are_both_in_doubt(ship):
     assert (finding.id, finding.channel, finding.safe) == ("sign", "r", False)
     assert "psi is reversed would explain as much" in finding.evidence
     assert "--fix-also sign" in finding.fix
+
+
+UNITS_OF_HEADING_AND_RATE = {
+    "deg/min as deg/s": (lambda d: {**d, "r": 60 * d["r"]}, {"r": 60}),
+    "rad/s as deg/s": (lambda d: {**d, "r": np.radians(d["r"])}, {"r": np.pi / 180}),
+    "rad as deg": (
+        lambda d: {**d, "psi": np.radians(d["psi"] % (2 * np.pi))}, {"psi": np.pi / 180},
+    ),
+    "rad and rad/s as degrees": (
+        lambda d: {**d, "psi": np.radians(d["psi"]), "r": np.radians(d["r"])},
+        {"psi": np.pi / 180, "r": np.pi / 180},
+    ),
+    "degrees, unwrapped": (lambda d: {**d, "psi": np.degrees(d["psi"])}, {"psi": 180 / np.pi}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNITS_OF_HEADING_AND_RATE)
+def test_the_course_tells_which_unit_is_wrong_of_heading_and_rate(name, ship):
+    plant, factors = UNITS_OF_HEADING_AND_RATE[name]
+    d = recorded(0, 2.0, seconds=300.0, wide=True)
+    log = as_recording(plant({n: v for n, v in d.items() if n not in ("u", "v")}))
+    findings = check_recording(log, ship).findings
+    assert {f.channel: f.value for f in findings} == pytest.approx(factors)
+    assert all(f.id == "unit" and f.safe for f in findings)
+    mended = derive_signals(apply_repairs(log, findings))
+    np.testing.assert_allclose(mended["r"].value, d["r"], rtol=1e-12)
+    turns = (mended["psi"].value - d["psi"]) / (2 * np.pi)
+    np.testing.assert_allclose(turns, np.round(turns[0]), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "doubt"),
+    [
+        ("rad/s as deg/s", "psi holds degrees where a log has radians"),
+        ("degrees, unwrapped", "psi holds degrees where a log has radians"),
+    ],
+)
+def test_without_a_course_the_unit_of_heading_or_rate_is_asked(name, doubt, ship):
+    d = recorded(0, 2.0, seconds=300.0, wide=True)
+    d = {n: d[n] for n in ("t", "psi", "r")}
+    (found,) = check_recording(as_recording(UNITS_OF_HEADING_AND_RATE[name][0](d)), ship).findings
+    assert (found.id, found.channel, found.safe) == ("unit", "r", False)
+    assert f"that {doubt} would explain as much" in found.evidence
+    # a factor that is of the yaw rate alone needs no course, unless degrees make many turns
+    for turns in (False, True):
+        d = recorded(0, 2.0, seconds=300.0, wide=turns)
+        d = {"t": d["t"], "psi": d["psi"], "r": 60 * d["r"]}
+        (found,) = check_recording(as_recording(d), ship).findings
+        assert (found.channel, found.value, found.safe) == ("r", 60, not turns)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["training-ship-105m", pytest.param("kvlcc2-320m", marks=pytest.mark.long),
+     pytest.param("azimuth-ferry-18m", marks=pytest.mark.long)],
+)  # fmt: skip
+def test_the_unit_of_heading_or_rate_is_told_on_other_ships(name, tmp_path):
+    preset = presets()[name]
+    length = 400 * max(1, preset.ship.length / 50) ** 0.5
+    trial = preset.sail(manoeuvres.everyday(), length, seed=1, **preset.weather(1, waves=True))
+    vessel = vessel_from_dict(tomllib.loads(preset.ship.vessel_toml()))
+    d = {n: v for n, v in trial.columns().items() if n not in ("u", "v")}
+    for plant, factors in UNITS_OF_HEADING_AND_RATE.values():
+        findings = check_recording(as_recording(plant(d)), vessel).findings
+        units = {f.channel: f.value for f in findings if f.id == "unit" and f.safe}
+        assert units == pytest.approx(factors)
 
 
 @pytest.mark.parametrize(("turned", "side"), [(0.6, "34 deg to port"), (-0.6, "34 deg to star")])

@@ -3,13 +3,15 @@
 Each alternative is a small change to how columns are read. All are compared by
 the likelihood of positions against velocities and of heading against yaw rate;
 the fewest changes win unless the gain is beyond doubt. Where no velocities tie the
-heading to positions, the course over ground tells whether heading or yaw rate is reversed.
+heading to positions, heading and yaw rate tell only the ratio of their units and signs:
+the course over ground then tells which of the two is read wrongly.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -21,7 +23,7 @@ from greybox.trial.checks.course import PLAUSIBLE, Course, course_scatter
 from greybox.trial.checks.finding import Finding, Outcome, declare_unit, exact_finding
 from greybox.trial.checks.motion import Motion, integrate, profiles, read_together, to_ned
 from greybox.trial.checks.wind_convention import STEADIER
-from greybox.trial.convert.derived_signals import continuous
+from greybox.trial.convert.derived_signals import continuous, usual_reach
 from greybox.trial.raw_log import Array
 from greybox.trial.steps import Step, mend
 from greybox.units import UNITS
@@ -42,6 +44,12 @@ _LATENESS = (-3.0, *(k / 4 for k in range(-8, 9) if k), 3.0, 4.5)
 # residuals whitened together hold about so many numbers
 _AT_ONCE = 100_000
 _DEG = np.pi / 180
+# readings that explain less by no more than this are as good as the best
+_ALIKE = 3.0
+# wrapped radians that were read as degrees reach no further than this [rad]
+_TURN_OF_RADIANS = 1.1 * 2 * np.pi * _DEG
+# what reaches further is hardly a heading in radians [rad]
+_TURNS = 4 * np.pi
 _KNOT = UNITS["kn"].factor
 
 
@@ -104,6 +112,23 @@ def _unit(
     )  # fmt: skip
 
 
+def _read_as(name: str, factor: float, said: str, held: str) -> ColumnHypothesis:
+    """Return that a column was read in the unit that its name says and holds another one."""
+
+    def apply(x: Values) -> Values:
+        value = x[name] * factor
+        # as numbers between plus and minus 0.11 it showed no wraps
+        return {**x, name: np.unwrap(value) if name == "psi" else value}
+
+    return ColumnHypothesis(
+        "unit", name, (name,), apply, (mend("scale", (name,), factor=factor),),
+        f"{name} holds {held} that were read as {said}",
+        f'write unit = "{held}" at its column under [columns] of the vessel file and read the raw '
+        f"file again, or let greybox import --fix convert the log",
+        1 / factor, f"{held} per {said}",
+    )  # fmt: skip
+
+
 def _swap(a: str, b: str, *, group: str, words: str = "") -> ColumnHypothesis:
     return ColumnHypothesis(
         "sign", group, (a, b), lambda x: {**x, a: x[b], b: x[a]}, (mend("exchange", (a, b)),),
@@ -142,6 +167,7 @@ _PSI = (
         "psi holds degrees where a log has radians",
         declare_unit(("psi",), "deg"), 180 / np.pi, "deg per rad",
     ),
+    _read_as("psi", 1 / _DEG, "deg", "rad"),
     ColumnHypothesis(
         "sign", "psi", ("psi",), lambda x: {**x, "psi": x["psi"] + np.pi},
         (mend("offset", ("psi",), offset=np.pi),),
@@ -153,6 +179,8 @@ _RATE = (
     _sign("r", group="r"),
     _unit(("r",), "r", _DEG, "rad/s", "deg/s"),
     _unit(("r",), "r", _DEG / 60, "rad/s", "deg/min"),
+    _read_as("r", 1 / 60, "deg/s", "deg/min"),
+    _read_as("r", 1 / _DEG, "deg/s", "rad/s"),
 )
 _VELOCITY = (
     _sign("u", group="velocity"),
@@ -180,8 +208,11 @@ _ACROSS = (
 
 
 _CHANGES = (*_PSI, *_RATE, *_VELOCITY, *_POSITION, *_ACROSS)
-# heading and yaw rate by themselves agree alike under each of these
-_REVERSED_RATE, _REVERSED_HEADING, _HEADING_FROM_EAST = _SENSES = (_RATE[0], _PSI[0], _PSI[1])
+_HEADING_IN_DEGREES, _HEADING_IN_RADIANS = _PSI[2:4]
+# both were read as degrees
+_SHARED = (_HEADING_IN_RADIANS, _RATE[4])
+# what heading and yaw rate by themselves cannot tell from another reading of the two
+_OF_HEADING_AND_RATE = (*_PSI[:4], *_RATE)
 
 
 @dataclass(frozen=True)
@@ -257,46 +288,90 @@ def _settle(logs: Sequence[_Alternatives], courses: Sequence[Course], key: Key) 
     """Choose among the readings that heading and yaw rate alone cannot tell from `key`.
 
     The course over ground turns with the true heading, and a hull that goes ahead keeps it near
-    the bow. What neither tells is left at the fewest changes: nothing is derived from the yaw rate.
+    the bow. What neither tells is left at the fewest changes, of the yaw rate sooner than of the
+    heading: nothing is derived from the yaw rate.
     """
-    changes = _changes(logs, key)
-    if any(log.motion.positioned for log in logs) or not any(c in _SENSES for c in changes):
+    if any(log.motion.positioned for log in logs):
         return _Settled(key)
-    rest = tuple(c for c in changes if c not in _SENSES)
+    rivals = {r: _of_heading(_changes(logs, r)) for r in _rivals(logs, key)}
+    if len(set(map(_words, rivals.values()))) < 2:
+        return _Settled(key)
+    lie = {r: course_scatter(courses, partial(_heading, turned)) for r, turned in rivals.items()}
+    steadiest = min(scatter for scatter, _ in lie.values())
+    kept = [r for r in rivals if lie[r][0] <= STEADIER * steadiest]
+    told = len(kept) < len(rivals)
+    if any(c.id == "unit" for turned in rivals.values() for c in turned):
+        # a course that hardly turns lies best to a heading that hardly does
+        told &= STEADIER * steadiest < course_scatter(courses, np.zeros_like)[0]
+    if not told:
+        return _undecided(logs, rivals, key)
+    # one that counts from elsewhere turns alike
+    chosen = min(kept, key=lambda r: (len(r), abs(lie[r][1])))
+    other = next((r for r in kept if _words(rivals[r]) != _words(rivals[chosen])), None)
+    if not rivals[chosen]:
+        return _Settled(chosen, True, "; the course turns with psi as it is")
+    signs = any(c.id != "unit" for c in rivals[chosen])
+    remark = f"; the course {'turns against' if signs else 'does not turn with'} psi as it is"
+    off = abs(lie[chosen][1])
+    if other is None or off < PLAUSIBLE:
+        return _Settled(chosen, True, remark)
+    doubt = " and ".join(c.words for c in rivals[other])
+    remark += f", {np.degrees(off):.0f} deg off the bow so read: perhaps {doubt}"
+    return _Settled(chosen, False, remark)
 
-    def scatter(*more: ColumnHypothesis) -> tuple[float, float]:
-        turned = [c for c in (*rest, *more) if c.channels == ("psi",)]
 
-        def heading(psi: Array) -> Array:
-            for c in turned:
-                psi = c.apply({"psi": psi})["psi"]
-            return psi
-
-        return course_scatter(courses, heading)
-
-    (as_named, _), (against, angle) = scatter(), scatter(_REVERSED_HEADING)
-    east = scatter(_HEADING_FROM_EAST)[1]
-    change, sure, remark = _REVERSED_RATE, True, "; the course turns with psi as it is"
-    if against * STEADIER < as_named:
-        off, other = abs(angle), _HEADING_FROM_EAST
-        change = _REVERSED_HEADING
-        if abs(east) < off:
-            off, change, other = abs(east), other, change
-        sure = bool(off < PLAUSIBLE)
-        remark = "; the course turns against psi as it is"
-        if not sure:
-            remark += f", {np.degrees(off):.0f} deg off the bow so read: perhaps {other.words}"
-    elif as_named * STEADIER >= against:
-        sure = False
-        remark = (
-            f"; that {_REVERSED_HEADING.words} would explain as much, and no course tells which"
+def _rivals(logs: Sequence[_Alternatives], key: Key) -> list[Key]:
+    """Return the readings of heading and yaw rate that explain as much as `key`, and itself."""
+    changes = _changes(logs, key)
+    if not all(c in _OF_HEADING_AND_RATE for c in changes):
+        return [key]
+    best = sum(log.gain(key) for log in logs)
+    least = best - _ALIKE * max(log.sample_correlation_factor for log in logs)
+    known = {k: made for log in logs for k, (made, _, _) in log.ranked.items()}
+    return [
+        k
+        for k, made in known.items()
+        if k == key
+        # where the columns agree as they are named, they hold at most one unit that both share
+        or (
+            (bool(changes) or made == _SHARED)
+            and all(c in _OF_HEADING_AND_RATE for c in made)
+            and sum(log.gain(k) for log in logs) >= least
         )
-    words = {*_words(rest), change.words}
-    for log in logs:
-        for found in log.ranked:
-            if set(found) == words:
-                return _Settled(found, sure, remark)
-    return _Settled(key, False, remark)
+    ]
+
+
+def _undecided(
+    logs: Sequence[_Alternatives], rivals: Mapping[Key, tuple[ColumnHypothesis, ...]], key: Key
+) -> _Settled:
+    """Return the reading of the fewest changes, in doubt where another one has as few."""
+    reach = max(usual_reach(log.motion["psi"]) for log in logs)
+
+    def likely(r: Key) -> bool:
+        if _HEADING_IN_RADIANS in rivals[r] and reach > _TURN_OF_RADIANS:
+            return False
+        return len(r) == len(key) or (_HEADING_IN_DEGREES in rivals[r] and reach > _TURNS)
+
+    kept = list(filter(likely, rivals))
+    if len({_words(rivals[r]) for r in kept}) < 2:
+        return _Settled(next(iter(kept), key))
+    chosen = min(kept, key=lambda r: (len(r), len(rivals[r])))
+    other = next(r for r in kept if _words(rivals[r]) != _words(rivals[chosen]))
+    doubt = " and ".join(c.words for c in _changes(logs, other))
+    return _Settled(
+        chosen, False, f"; that {doubt} would explain as much, and no course tells which"
+    )
+
+
+def _of_heading(changes: Iterable[ColumnHypothesis]) -> tuple[ColumnHypothesis, ...]:
+    return tuple(c for c in changes if c.channels == ("psi",))
+
+
+def _heading(changes: Iterable[ColumnHypothesis], psi: Array) -> Array:
+    """Return a heading read with some changes."""
+    for c in changes:
+        psi = c.apply({"psi": psi})["psi"]
+    return psi
 
 
 def _reading(
@@ -344,7 +419,8 @@ def _decide(logs: Sequence[_Alternatives]) -> Key:
             for log in logs
             if log.applies(change)
         )
-        if not silent.channels or lost >= _LEAST_GAIN:
+        told = any(n in log.motion for n in silent.channels for log in logs)
+        if not told or lost >= _LEAST_GAIN:
             kept.append(change)
     return _words(kept)
 
@@ -494,6 +570,9 @@ def _late(motion: Motion) -> Iterator[ColumnHypothesis]:
 
 def _silent(changes: tuple[ColumnHypothesis, ...]) -> ColumnHypothesis:
     names = tuple(n for c in changes for n in c.channels if n in ("u", "v", "r"))
+    if _HEADING_IN_RADIANS in changes:
+        # beside a heading 57 times as large the yaw rate is small
+        names += ("r",)
     return ColumnHypothesis(
         "sign", "silent", names, _scaled(names, 0.0), (),
         f"without {', '.join(names)}", "",
