@@ -12,7 +12,7 @@ from greybox.errors import LogError, UsageError, suggestion
 from greybox.rotation import body_to_ned, ned_to_body
 from greybox.trial.checks.finding import IDS, CheckReport, Finding
 from greybox.trial.checks.signal_quality import clean
-from greybox.trial.convert.derived_signals import derive_signals
+from greybox.trial.convert.derived_signals import PLACE, derive_signals
 from greybox.trial.raw_log import Array, Recording, Signal
 from greybox.trial.steps import Step, mend
 from greybox.trial.time_format import unpadded_numbers
@@ -150,7 +150,7 @@ def apply_repairs(recording: Recording, findings: Iterable[Finding]) -> Recordin
         if step not in recording.steps
     ]
     for step in steps:
-        if step.operation in _ON_DERIVED:
+        if step.operation in _ON_DERIVED or _lacks_derived(recording, step):
             # not before: what was interpolated across a wrap must go before it is unwrapped
             recording = derive_signals(recording)
         recording = _ACTIONS[step.operation](recording, step)
@@ -244,8 +244,19 @@ def _offset(recording: Recording, step: Step) -> Recording:
     return _changed(recording, step.channels, lambda s: s.with_value(s.value + offset))
 
 
+def _lacks_derived(recording: Recording, step: Step) -> bool:
+    """Whether a step changes what is still to be derived, such as a local position."""
+    if step.operation not in ("scale", "offset"):
+        return False
+    return any(set(_MEASURED_AS.get(n, ())) & set(recording.names) for n in step.channels)
+
+
 def _exchange(recording: Recording, step: Step) -> Recording:
-    new = dict(zip(step.channels, (*step.channels[1:], step.channels[0]), strict=True))
+    names = step.channels
+    if names == PLACE and {"lat", "lon"} <= set(recording.names):
+        # a degree of longitude is shorter than one of latitude
+        names = ("lat", "lon")
+    new = dict(zip(names, (*names[1:], names[0]), strict=True))
     return recording.with_signals(
         replace(s, name=new.get(s.name, s.name)) for s in recording.signals
     )

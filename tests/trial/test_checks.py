@@ -12,8 +12,8 @@ from foreign_ships import manoeuvres, presets
 from virtual import as_recording, recorded
 
 from greybox.errors import LogError, UsageError
-from greybox.trial.checks.check import check_files, check_recording
-from greybox.trial.checks.course import course_findings
+from greybox.trial.checks.check import check_files, check_recording, misnamed_columns
+from greybox.trial.checks.course import course_findings, track_findings
 from greybox.trial.checks.finding import IDS, exact_finding, factor_of
 from greybox.trial.checks.thruster_response import answer_findings
 from greybox.trial.checks.wind_convention import wind_findings
@@ -22,6 +22,7 @@ from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.raw_log import Recording, Signal
 from greybox.trial.repair import apply_repairs, repair
 from greybox.trial.steps import mend
+from greybox.trial.store import write_log
 from greybox.vessel.toml import load_vessel, vessel_from_dict
 
 KNOT = 1852 / 3600
@@ -334,6 +335,129 @@ def test_the_unit_of_heading_or_rate_is_told_on_other_ships(name, tmp_path):
         findings = check_recording(as_recording(plant(d)), vessel).findings
         units = {f.channel: f.value for f in findings if f.id == "unit" and f.safe}
         assert units == pytest.approx(factors)
+
+
+def by_satellite(seed: int = 0, lat: float = 48.0, **of) -> dict[str, np.ndarray]:
+    """A trial as a satellite compass tells it: latitude and longitude, speed and course."""
+    d = recorded(seed, 1.0, seconds=400.0, wide=True, **of)
+    north, east = ned(d["psi"], d["u"], d["v"])
+    d["sog"], d["cog"] = np.hypot(north, east), np.arctan2(east, north) % (2 * np.pi)
+    d["lat"] = lat + np.degrees(d["x_n"] / 6.371e6)
+    d["lon"] = np.degrees(d["y_n"] / 6.371e6 / np.cos(np.radians(lat))) - 4.5
+    return {n: v for n, v in d.items() if n not in ("u", "v", "x_n", "y_n")}
+
+
+def ned(psi, u, v):
+    c, s = np.cos(psi), np.sin(psi)
+    return c * u - s * v, s * u + c * v
+
+
+TRACKS = {
+    "knots as m/s": (
+        lambda d: {**d, "sog": d["sog"] / KNOT}, ("unit", ("sog",), 1 / KNOT, True),
+    ),
+    "m/s as knots": (lambda d: {**d, "sog": d["sog"] * KNOT}, ("unit", ("sog",), KNOT, True)),
+    "km/h as knots": (
+        lambda d: {**d, "sog": d["sog"] * 3.6 * KNOT}, ("unit", ("sog",), 3.6 * KNOT, True),
+    ),
+    "no unit": (lambda d: {**d, "sog": d["sog"] * 1.42}, ("unit", ("sog",), 1.42, False)),
+    "lat and lon swapped": (lambda d: swap(d, "lat", "lon"), ("sign", ("lat", "lon"), 0, True)),
+    "west for east": (lambda d: negate(d, "lon"), ("sign", ("lon",), -1, True)),
+    "south for north": (lambda d: negate(d, "lat"), ("sign", ("lat",), -1, True)),
+    "course from east": (
+        lambda d: {**d, "cog": (np.pi / 2 - d["cog"]) % (2 * np.pi)}, ("frame", ("cog",), 0, True),
+    ),
+    "course astern": (lambda d: {**d, "cog": d["cog"] + np.pi}, ("sign", ("cog",), np.pi, True)),
+    "swapped beyond the poles": (
+        lambda d: {**d, "lat": d["lon"] + 130, "lon": d["lat"]}, ("sign", ("lat", "lon"), 0, True),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TRACKS)
+def test_positions_and_velocity_over_ground_are_compared(name, ship):
+    plant, (kind, channels, value, safe) = TRACKS[name]
+    log = as_recording(plant(by_satellite()))
+    (found,) = track_findings(log)
+    assert (found.id, found.channels, found.safe) == (kind, channels, safe)
+    if kind == "unit":
+        assert found.value == pytest.approx(value, rel=0.01)
+        # a sphere of 6371 km is not WGS 84
+        assert found.ci[0] - 0.005 * value < value < found.ci[1] + 0.005 * value
+    else:
+        assert found.value == value
+    if safe:
+        assert not track_findings(apply_repairs(log, [found]))
+        others = [f.id for f in check_recording(log, ship).findings]
+        assert others == [kind]
+
+
+def test_positions_that_agree_with_the_velocity_over_ground_are_no_finding(ship):
+    d = by_satellite()
+    assert not track_findings(as_recording(d))
+    assert not check_recording(as_recording(d), ship).findings
+    # rounded as a bridge shows them
+    d |= {"sog": np.round(d["sog"], 1), "cog": np.radians(np.round(np.degrees(d["cog"])))}
+    assert not track_findings(as_recording(d))
+
+
+def test_without_a_heading_either_of_position_and_course_may_be_mirrored():
+    d = swap(by_satellite(), "lat", "lon")
+    (found,) = track_findings(as_recording({n: v for n, v in d.items() if n != "psi"}))
+    assert (found.id, found.channels, found.safe) == ("sign", ("lat", "lon"), False)
+    assert "perhaps cog counts from east" in found.evidence
+    assert "--fix-also sign" in found.fix
+
+
+@pytest.mark.parametrize("name", ["knots as m/s", "lat and lon swapped"])
+def test_a_log_of_speed_and_course_is_judged_by_its_positions(name, ship, tmp_path):
+    plant, (kind, *_) = TRACKS[name]
+    log = tmp_path / "log.csv"
+    write_log(import_recording(as_recording(plant(by_satellite())), ship).segments, log)
+    (report,) = check_files([log], ship)
+    (found,) = report.findings
+    channels = ("u", "v") if kind == "unit" else ("x_n", "y_n")
+    # the length of a degree is known to the raw file alone
+    assert (found.id, found.channels, found.safe) == (kind, channels, kind == "unit")
+    assert "under [columns]" in found.fix or "in [columns] and read the raw file again" in found.fix
+    assert misnamed_columns([log], ship)
+
+
+@pytest.mark.parametrize(
+    ("plant", "channels"),
+    [
+        (lambda d: swap(d, "x_n", "y_n"), ("x_n", "y_n")),
+        (lambda d: negate(d, "y_n"), ("y_n",)),
+        (lambda d: negate(d, "x_n"), ("x_n",)),
+    ],
+)
+def test_a_course_against_the_heading_is_one_of_mirrored_positions(plant, channels, ship):
+    d = recorded(0, 1.0, seconds=400.0, wide=True)
+    d = {n: v for n, v in d.items() if n not in ("u", "v")}
+    log = as_recording(plant(d))
+    (found,) = check_recording(log, ship).findings
+    assert (found.id, found.channels, found.safe) == ("sign", channels, False)
+    assert "that psi and r are reversed would explain as much" in found.evidence
+    assert not check_recording(apply_repairs(log, [found]), ship).findings
+    # positions and velocity over ground that agree leave the heading
+    d = negate(by_satellite(), "psi", "r")
+    found = next(f for f in check_recording(as_recording(d), ship).findings if f.id == "sign")
+    assert (found.channels, found.safe) == (("psi", "r"), False)
+
+
+def test_no_hull_goes_sideways_at_the_speed_of_a_ship(ship):
+    t = np.arange(600.0)
+    course = 0.01 * t
+    d = {"t": t, "x_n": 700 * np.sin(course), "y_n": -700 * np.cos(course)}
+    rng = np.random.default_rng(1)
+    psi = course + np.radians(100) + 0.6 * np.sin(t / 20) + 0.01 * rng.standard_normal(len(t))
+    (found,), _ = course_findings(as_recording(d | {"psi": psi}), ship)
+    assert (found.id, found.safe, found.repair) == ("heading_bias", False, ())
+    assert found.ci[0] < np.radians(100) < found.ci[1]
+    assert "a vessel does not go so sideways" in found.evidence
+    # in a stream a slow boat does
+    slow = d | {"x_n": d["x_n"] / 20, "y_n": d["y_n"] / 20, "psi": psi}
+    assert not [f for f in course_findings(as_recording(slow), ship)[0] if not f.repair]
 
 
 @pytest.mark.parametrize(("turned", "side"), [(0.6, "34 deg to port"), (-0.6, "34 deg to star")])

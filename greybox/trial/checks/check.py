@@ -13,7 +13,7 @@ from greybox.files import real_path
 from greybox.numerics.parallel import map_forked
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.checks.actuators import measure_actuators
-from greybox.trial.checks.course import course_findings, make_course
+from greybox.trial.checks.course import course_findings, make_course, track_findings
 from greybox.trial.checks.external_force import force_findings
 from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome
 from greybox.trial.checks.frame_sign_unit import (
@@ -230,7 +230,10 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
     # before the heading is unwrapped
     raw += wrap_findings(first_run(apply_repairs(recording, raw)))
     raw += angle_unit_findings(recording, vessel)
-    whole = derive_signals(first_run(apply_repairs(recording, raw)))
+    mended = first_run(apply_repairs(recording, raw))
+    tracks = track_findings(mended)
+    raw += tracks
+    whole = derive_signals(apply_repairs(mended, [f for f in tracks if f.safe]))
     log = _Log(recording, raw, {}, whole)
     log.add(hold_findings(_independent(whole)))
     measured = _independent(log.mended)
@@ -272,7 +275,10 @@ def _kinematics(logs: Sequence[_Log], vessel: Vessel) -> None:
         log.findings += found
         log.say(said)
     for log, motion in zip(logs, motions, strict=True):
-        if motion is None or not motion.positioned:
+        doubt = _in_doubt(log.findings)
+        if doubt is not None:
+            log.say([Outcome("heading_bias", "cannot tell", doubt)])
+        elif motion is None or not motion.positioned:
             found, said = course_findings(log.mended, vessel)
             log.findings += found
             log.say(said)
@@ -288,15 +294,20 @@ def _forces(logs: Sequence[_Log], vessel: Vessel) -> None:
     signs = answer_findings(own, vessel, [log.findings for log in logs])
     for log, forces, reason, found in zip(logs, pushed, untold, signs, strict=True):
         log.findings += found
-        doubt = next(
-            (f for f in log.findings if f.id in ("sign", "frame", "unit") and not f.safe), None
-        )
+        doubt = _in_doubt(log.findings)
         if doubt is not None:
-            said = f"the {doubt.id} of {', '.join(doubt.channels)} must be settled first"
-            log.say([Outcome("external_force", "cannot tell", said)])
+            log.say([Outcome("external_force", "cannot tell", doubt)])
             continue
         log.findings += forces
         log.say([reason] if reason is not None else [])
+
+
+def _in_doubt(findings: Sequence[Finding]) -> str | None:
+    """Return what must be settled before more is told, None where nothing must."""
+    doubt = next((f for f in findings if f.id in ("sign", "frame", "unit") and not f.safe), None)
+    if doubt is None:
+        return None
+    return f"the {doubt.id} of {', '.join(doubt.channels)} must be settled first"
 
 
 def _actuators(logs: Sequence[_Log], vessel: Vessel) -> tuple[ActuatorEstimate, ...]:
