@@ -5,6 +5,8 @@ The sentences are made of the schema's typed errors: kind, place and value.
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args
 
@@ -325,6 +327,9 @@ def _sentence(error: ValidationError, source: str) -> str:
     if place.table is SensorsTable and len(place.path) == 1:
         # a sensor's number is known by its key alone
         number = place.key
+    in_radians = _in_radians(place, first["input"])
+    if kind == "float_type" and in_radians:
+        return in_radians
     return (_BY_KIND.get(kind) or _BY_KEY.get(place.key, _WORD)).format(
         where=place.where,
         name=place.name,
@@ -332,6 +337,23 @@ def _sentence(error: ValidationError, source: str) -> str:
         value=_shown(value),
         tag=tag,
         near=suggestion(word, _CHOICES.get("type" if tag else place.key, ())),
+    )
+
+
+def _in_radians(place: _Place, value: Any) -> str:
+    """Return what is said of an angle that is written with its unit, "" of anything else."""
+    if not isinstance(value, str) or not place.key.startswith(("angle_", "rudder_")):
+        return ""
+    written = re.fullmatch(r"\s*([-+]?[\d.]+)\s*(?:deg|degrees?|°)\s*(/\s*s)?\s*", value)
+    if written is None:
+        return ""
+    try:
+        number = math.radians(float(written[1]))
+    except ValueError:
+        return ""
+    return (
+        f"{place.name} is {_shown(value)}, a number is needed, in radians: {number:.4g} for "
+        f"{value.strip()}."
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import floor, inf, isfinite
+from math import floor, inf, isfinite, radians
 from typing import Any, Literal, get_args
 
 from greybox.channels import CHANNELS
@@ -157,6 +157,8 @@ class Thruster:
         return tuple(found)
 
 
+# angles that turn faster [rad/s] are seldom meant
+_QUICK = 1.0
 # what follows slowly, beside one column by its name
 LagOn = Literal["force", "speed", "angle", "command"]
 DelayOn = Literal["speed", "angle", "command"]
@@ -401,6 +403,25 @@ class Vessel(DisplayMixin):
         if name in self.recorded_angles:
             return "rad"
         return CHANNELS[name].unit if name in CHANNELS else None
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What the file states that is possible, and is seldom meant."""
+        said = []
+        for i, t in enumerate(self.thrusters, 1):
+            if t.rudder is not None and t.x > 0:
+                said.append(
+                    f"the rudder of thruster {i} stands at x = {t.x:g} m, ahead of the "
+                    f"origin: sign of x? Forward is positive."
+                )
+            for kind, _, _, limits in t.movements:
+                if kind != "speed" and limits.rate is not None and limits.rate > _QUICK:
+                    said.append(
+                        f"{kind}_rate of thruster {i} is {limits.rate:g} rad/s, which only "
+                        f"servos of small models reach: write radians, "
+                        f"{radians(limits.rate):.4g} if {limits.rate:g} deg/s is meant."
+                    )
+        return tuple(said)
 
     @property
     def limits(self) -> dict[str, Limits]:

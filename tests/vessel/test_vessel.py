@@ -294,6 +294,46 @@ def test_limits_of_a_rudder_are_not_degrees():
         vessel(rudder)
 
 
+RUDDER = {"type": "propeller_rudder", "x": -1.0, "speed": "n", "rudder": "d"}
+
+
+def test_rates_of_angles_are_not_degrees_per_second():
+    big = {"name": "ship", "length": 105.0}
+    with pytest.raises(VesselError, match=r"3 rad/s, .* 105 m 1 rad/s .* 0\.05236 for 3 deg/s"):
+        vessel_from_dict({**big, "thruster": [{**RUDDER, "rudder_rate": 3}]})
+    with pytest.raises(VesselError, match=r"angle_rate of thruster 1 is 12 rad/s"):
+        vessel_from_dict({**big, "thruster": [{**AZIMUTH, "angle_rate": 12}]})
+    # servos of models are quick, and deg/s of a model are possible
+    model = {"name": "model", "length": 2.0}
+    quick = vessel_from_dict({**model, "thruster": [{**RUDDER, "rudder_rate": 3}]})
+    assert "write radians, 0.05236 if 3 deg/s is meant" in quick.doubts[0]
+    for rate in (0.3, 1.0):
+        slow = vessel_from_dict({**model, "thruster": [{**RUDDER, "rudder_rate": rate}]})
+        assert not slow.doubts
+
+
+def test_a_rudder_ahead_of_the_origin_is_asked_about():
+    (doubt,) = vessel({**RUDDER, "x": 14.0}).doubts
+    assert "x = 14 m, ahead of the origin: sign of x?" in doubt
+    assert not vessel(RUDDER).doubts
+    assert not vessel({**AZIMUTH, "x": 14.0}).doubts
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rudder_limits": ["-35 deg", "35 deg"]}, "is '-35 deg', .* in radians: -0.6109 for -35"),
+        ({"rudder_limits": [-0.6, "35°"]}, "in radians: 0.6109 for 35°"),
+        ({"rudder_rate": "3 deg/s"}, "in radians: 0.05236 for 3 deg/s"),
+        ({"rudder_limits": [-0.6, "far"]}, "a finite number is needed"),
+        ({"speed_limits": [0, "35 deg"]}, "a finite number is needed"),
+    ],
+)
+def test_angles_are_written_in_radians(change, message):
+    with pytest.raises(VesselError, match=message):
+        vessel({**RUDDER, **change})
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
