@@ -15,6 +15,7 @@ from greybox.errors import LogError, UsageError
 from greybox.trial.checks.check import check_files, check_recording, misnamed_columns
 from greybox.trial.checks.course import course_findings, track_findings
 from greybox.trial.checks.finding import IDS, exact_finding, factor_of
+from greybox.trial.checks.signal_quality import angle_unit_findings, still_rudder_findings
 from greybox.trial.checks.thruster_response import answer_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.convert import import_recording
@@ -458,6 +459,62 @@ def test_no_hull_goes_sideways_at_the_speed_of_a_ship(ship):
     # in a stream a slow boat does
     slow = d | {"x_n": d["x_n"] / 20, "y_n": d["y_n"] / 20, "psi": psi}
     assert not [f for f in course_findings(as_recording(slow), ship)[0] if not f.repair]
+
+
+SINGLE_SCREW = {
+    "name": "single screw", "length": 100.0,
+    "thruster": [
+        {"type": "propeller_rudder", "x": -48.0, "speed": "n", "rudder": "delta",
+         "rudder_limits": [-0.61, 0.61]},
+    ],
+}  # fmt: skip
+
+
+def zigzag(reach: float = 20.0, gain: float = 0.07, seconds: float = 600.0):
+    """A ship of 100 m at 7 m/s that follows its rudder of `reach` [deg] by Nomoto's equation."""
+    t = np.arange(seconds)
+    delta = np.radians(reach) * np.sign(np.sin(t / 25))
+    r = np.zeros_like(t)
+    for k in range(len(t) - 1):
+        r[k + 1] = r[k] + (gain * delta[k] - r[k]) / 8
+    psi = np.cumsum(r) - r
+    track = np.cumsum(7 * np.exp(1j * psi))
+    return {
+        "t": t, "x_n": track.real, "y_n": track.imag, "psi": psi, "r": r, "delta": delta,
+        "n": 90 + np.zeros_like(t),
+    }  # fmt: skip
+
+
+def test_a_rudder_in_radians_under_degrees_is_asked_about():
+    vessel, d = vessel_from_dict(SINGLE_SCREW), zigzag()
+    assert not still_rudder_findings(derive_signals(as_recording(d)), vessel)
+    d["delta"] = np.radians(d["delta"])
+    (found,) = still_rudder_findings(derive_signals(as_recording(d)), vessel)
+    assert (found.id, found.channels, found.safe) == ("unit", ("delta",), False)
+    assert found.value == pytest.approx(np.pi / 180)
+    assert "stays within 0.35 deg while the ship turns by" in found.evidence
+    assert "up to 20 deg" in found.evidence
+    mended = apply_repairs(as_recording(d), [found])
+    np.testing.assert_allclose(mended["delta"].value, zigzag()["delta"])
+    # a small rudder turns the ship little, and another thruster turns it without a rudder
+    small = zigzag(reach=1.0)
+    assert not still_rudder_findings(derive_signals(as_recording(small)), vessel)
+    d["delta"] = 0.005 * np.sin(d["t"] / 7)
+    assert not still_rudder_findings(derive_signals(as_recording(d)), vessel)
+
+
+def test_a_propeller_speed_is_no_rudder():
+    vessel, d = vessel_from_dict(SINGLE_SCREW), zigzag()
+    (found,) = angle_unit_findings(as_recording({**d, "delta": 122 + 0 * d["t"]}), vessel)
+    assert (found.id, found.safe, found.repair) == ("unit", False, ())
+    assert "reaches 122, and no rudder passes 90 deg: wrong column?" in found.evidence
+    # as was read as degrees: of degrees under a radian name it cannot be told
+    (found,) = angle_unit_findings(as_recording({**d, "delta": 2.13 + 0 * d["t"]}), vessel)
+    assert found.repair
+    assert not found.safe
+    assert "or it is the wrong column" in found.evidence
+    (found,) = angle_unit_findings(as_recording({**d, "delta": np.degrees(d["delta"])}), vessel)
+    assert found.safe
 
 
 @pytest.mark.parametrize(("turned", "side"), [(0.6, "34 deg to port"), (-0.6, "34 deg to star")])

@@ -27,10 +27,12 @@ from greybox.trial.checks.position_hold import hold_findings
 from greybox.trial.checks.position_jump import jump_findings
 from greybox.trial.checks.sensor_offsets.findings import Tied, find_offsets
 from greybox.trial.checks.signal_quality import (
+    MOTION,
     angle_unit_findings,
     coarse_findings,
     missing_findings,
     spike_findings,
+    still_rudder_findings,
     stuck_findings,
     time_findings,
     time_format_findings,
@@ -186,7 +188,7 @@ def check_recordings(
             log.recorded.name,
             tuple(log.findings),
             _outcomes(log.findings, log.outcomes),
-            log.recorded.notes,
+            (*log.recorded.notes, *vessel.doubts),
             log.recorded,
             tuple(a for a in actuators if log.recorded.name in a.logs),
         )
@@ -248,6 +250,8 @@ def _signal_quality(recording: Recording, vessel: Vessel) -> _Log:
     if not {"x_n", "y_n"} <= set(whole.names):
         missing = "needs positions, which the log has not"
         log.say([Outcome(i, "cannot tell", missing) for i in ("position_hold", "position_jump")])
+    if not any(f.channel in vessel.rudders for f in raw):
+        log.add(still_rudder_findings(log.mended, vessel))
     log.motion = make_motion(_independent(log.mended))
     return log
 
@@ -275,7 +279,8 @@ def _kinematics(logs: Sequence[_Log], vessel: Vessel) -> None:
         log.findings += found
         log.say(said)
     for log, motion in zip(logs, motions, strict=True):
-        doubt = _in_doubt(log.findings)
+        of_motion = [f for f in log.findings if set(f.channels) & {*MOTION, "lat", "lon", "cog"}]
+        doubt = _in_doubt(of_motion)
         if doubt is not None:
             log.say([Outcome("heading_bias", "cannot tell", doubt)])
         elif motion is None or not motion.positioned:

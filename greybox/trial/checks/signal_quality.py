@@ -39,6 +39,11 @@ _MATERIAL = {
 }  # fmt: skip
 # steps of rounded values that matter, as a share of the signal's spread
 _COARSE = 0.004
+# a rudder that stays within so few degrees all the time is hardly one [deg]
+_HARDLY_MOVES = 3.5
+# rates of turn over so long [s], how many, and what a rudder near midships does not cause: radians
+# in a ship length, and correlation with the rudder
+_TURN_WINDOW, _LEAST_TURNED, _HARD_TURN, _FOLLOWS = 4.0, 20, 0.25, 0.4
 # a sensor that is stuck repeats itself this long
 STUCK_SECONDS = 3.0
 STUCK_SAMPLES = 8
@@ -516,6 +521,11 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
             continue
         if beyond := beyond_reach(s, vessel):
             largest, limit = beyond
+            if s.name in vessel.rudders and largest > 90:
+                found.append(_wrong_column(s, largest, limit))
+                continue
+            # 122 of a propeller that were read as degrees are 2.1
+            hardly = s.name in vessel.rudders and largest < _HARDLY_MOVES
             factor = float(np.pi / 180)
             why = (
                 "and steps by 360 where it passes a full turn"
@@ -529,14 +539,98 @@ def angle_unit_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
                     180 / np.pi,
                     "deg per rad",
                     f"{s.name} reaches {largest:.4g}, {why}: it holds degrees where a log has "
-                    f"radians",
-                    declare_unit((s.name,), "deg"),
+                    f"radians{', or it is the wrong column' if hardly else ''}",
+                    declare_unit((s.name,), "deg").replace(
+                        "--fix", "--fix-also unit" if hardly else "--fix"
+                    ),
                     (mend("scale", (s.name,), factor=factor),),
-                    True,
+                    not hardly,
                     {"t": s.t, "value": s.value, "limit": float(limit)},
                 )
             )
     return found
+
+
+def _wrong_column(s: Signal, largest: float, limit: float) -> Finding:
+    return exact_finding(
+        "unit", (s.name,), largest, "1",
+        f"{s.name} reaches {largest:.4g}, and no rudder passes 90 deg: wrong column?",
+        f"map the column of the rudder angle to {s.name} in [columns] of the vessel file",
+        picture={"t": s.t, "value": s.value, "limit": float(limit)},
+    )  # fmt: skip
+
+
+def still_rudder_findings(recording: Recording, vessel: Vessel) -> list[Finding]:
+    """Find rudders that hardly leave midships while the ship turns hard after them.
+
+    Parameters
+    ----------
+    recording : Recording
+        Derived: headings are continuous, positions local.
+    """
+    if not vessel.rudders & set(recording.names):
+        return []
+    turn = _rate_of_turn(recording)
+    if turn is None:
+        return []
+    t, rate, speed = turn
+    # turned through a radian in so many ship lengths
+    hard = float(np.quantile(np.abs(rate), 0.95)) * vessel.length / speed
+    if hard < _HARD_TURN:
+        return []
+    found = []
+    for s in recording.signals:
+        if s.name not in vessel.rudders or not s.known.any():
+            continue
+        reach = float(np.max(np.abs(s.value[s.known])))
+        angle = sampled(recording, s.name, t)
+        limits = vessel.limits.get(s.name)
+        most = max(abs(limits.lower or 0.0), abs(limits.upper or 0.0)) if limits else 0.0
+        if angle is None or not 0 < np.degrees(reach) < 1.2 * (most or np.pi / 3):
+            continue
+        if _follows(rate, angle, t, vessel.length / speed) < _FOLLOWS:
+            continue
+        found.append(
+            exact_finding(
+                "unit", (s.name,), np.pi / 180, "rad per deg",
+                f"{s.name} stays within {np.degrees(reach):.2g} deg while the ship turns by "
+                f"{np.degrees(hard):.0f} deg in a ship length: it may hold radians that were read "
+                f"as degrees, up to {np.degrees(np.degrees(reach)):.0f} deg",
+                'write unit = "rad" at its column under [columns] of the vessel file and read '
+                "the raw file again, or let greybox import --fix-also unit convert the log",
+                (mend("scale", (s.name,), factor=180 / np.pi),), False,
+                {"t": s.t, "value": s.value},
+            )
+        )  # fmt: skip
+    return found
+
+
+def _rate_of_turn(recording: Recording) -> tuple[Array, Array, float] | None:
+    """Return times, rate of turn [rad/s] and usual speed [m/s]; None where they cannot be told."""
+    if "psi" not in recording or not {"x_n", "y_n"} <= set(recording.names):
+        return None
+    t, psi = clean(recording["psi"])
+    if len(t) < _LEAST_TURNED or t[-1] - t[0] < 2 * _TURN_WINDOW:
+        return None
+    grid = np.arange(t[0], t[-1] - _TURN_WINDOW, _TURN_WINDOW / 4)
+    rate = (np.interp(grid + _TURN_WINDOW, t, psi) - np.interp(grid, t, psi)) / _TURN_WINDOW
+    north, east = (sampled(recording, n, np.concatenate([grid, grid + _TURN_WINDOW]))
+                   for n in ("x_n", "y_n"))  # fmt: skip
+    if north is None or east is None or len(grid) < _LEAST_TURNED:
+        return None
+    way = np.hypot(*(np.diff(v.reshape(2, -1), axis=0)[0] for v in (north, east)))
+    speed = float(np.median(way)) / _TURN_WINDOW
+    return (grid + _TURN_WINDOW / 2, rate, speed) if speed > 0.1 else None
+
+
+def _follows(rate: Array, angle: Array, t: Array, length_time: float) -> float:
+    """Return how far a rate of turn follows an angle, lagged by up to three ship lengths."""
+    best = 0.0
+    for lag in np.linspace(0.0, 3.0, 7) * length_time:
+        before = np.interp(t - lag, t, angle)
+        if np.ptp(before) > 0 and np.ptp(rate) > 0:
+            best = max(best, abs(float(np.corrcoef(before, rate)[0, 1])))
+    return best
 
 
 def _motion(recording: Recording) -> Iterable[Signal]:

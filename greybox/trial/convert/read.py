@@ -219,6 +219,12 @@ def _clean_recording(
     recording = replace(canonical(raw, assigned, vessel), steps=(*known.steps, *raw.steps))
     for rudder in (s for s in recording.signals if s.name in vessel.rudders):
         if beyond := beyond_reach(rudder, vessel):
+            if beyond[0] > 90:
+                raise LogError(
+                    f"'{rudder.name}' of '{table.path.name}' reaches {beyond[0]:.4g}, and no "
+                    f"rudder passes 90 deg: wrong column? Map that of the rudder angle in "
+                    f"[columns]."
+                )
             raise LogError(
                 f"'{rudder.name}' of '{table.path.name}' reaches {beyond[0]:.4g}, above the "
                 f"{beyond[1]:.3g} rad of a right angle: it holds degrees. Convert it to radians, "
