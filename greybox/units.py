@@ -73,6 +73,8 @@ UNITS: dict[str, Unit] = {
         Unit("1", "1", 1.0),
     )
 }  # fmt: skip
+# what the speed of a propeller is never counted in; thrust, shares and rad/s may stand for it
+_NO_SPEED_OF_A_PROPELLER = frozenset({"rad", "m", "s"})
 _SPELLED = {word: u.symbol for u in UNITS.values() for word in u.spellings}
 # the longest suffix decides: '_rad_s' must not be read as '_s'
 _SUFFIXES = sorted(
@@ -140,7 +142,8 @@ def unit_factor(unit: str, target: str | None, name: str) -> float:
     if found is None:
         wanted = "rad" if target == "deg" else target
         words = {**dict.fromkeys(UNITS), **_SPELLED}
-        near = suggestion(unit, (w for w in words if wanted in (None, unit_dimension(w))))
+        fit = [w for w in words if wanted in (None, unit_dimension(w))]
+        near = suggestion(unit, [w for w in fit if sorted(w) == sorted(unit.lower())] or fit)
         raise LogError(
             f"column '{name}' has the unknown unit '{unit}'.{near} "
             f"Known units: {', '.join(sorted(UNITS))}."
@@ -148,6 +151,11 @@ def unit_factor(unit: str, target: str | None, name: str) -> float:
     if target == "deg" and found.si == "rad":
         # geographic angles stay in degrees, the unit of every geodesy library
         return found.factor / _DEGREE
+    if target is None and found.si in _NO_SPEED_OF_A_PROPELLER:
+        raise LogError(
+            f"column '{name}' is in '{unit}', which no propeller speed has: map the column of the "
+            f"propeller's speed, or correct its unit in [columns]."
+        )
     if target is not None and found.si != target:
         raise LogError(
             f"column '{name}' is in '{unit}' but its channel is in '{target}': "

@@ -106,3 +106,19 @@ def test_unix_times_in_seconds_from_their_size():
         np.testing.assert_allclose(unix_seconds(seconds * factor), seconds, rtol=1e-12)
     nothing = np.full(2, np.nan)
     np.testing.assert_array_equal(unix_seconds(nothing), nothing)
+
+
+def test_letters_in_another_order_are_told_first():
+    with pytest.raises(LogError, match=r"unknown unit 'rmp'\. Did you mean 'rpm'"):
+        unit_factor("rmp", None, "n")
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad", "m", "s"])
+def test_no_propeller_speed_is_an_angle(unit):
+    with pytest.raises(LogError, match="which no propeller speed has"):
+        unit_factor(unit, None, "n")
+
+
+@pytest.mark.parametrize("unit", ["rpm", "rps", "rad/s", "kN", "1"])
+def test_what_stands_for_a_propeller_speed(unit):
+    assert unit_factor(unit, None, "n") > 0

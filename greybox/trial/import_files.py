@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -28,6 +29,9 @@ from greybox.trial.readers.formats import is_bag, open_raw
 from greybox.trial.repair import check_ids, repair
 from greybox.trial.store import record_path, write_log
 from greybox.vessel.vessel import Vessel
+
+# recordings of one trial are not so far apart [s]
+_ANOTHER_TRIAL = 3600.0
 
 
 def raw_files(paths: Sequence[str]) -> list[str]:
@@ -122,6 +126,7 @@ def import_files(
                 lines = [f"mended: {n}" for n in fixed] + [f"left as it is: {n}" for n in left]
                 summaries.append(_write(mended, vessel, target, options, extra, lines))
         progress(len(logs), len(logs))
+    summaries += [f"note: {doubt}" for doubt in vessel.doubts]
     return "\n".join(summaries)
 
 
@@ -214,7 +219,7 @@ def _import_trial(
                 [f"note: {n}" for n in notes],
             )
     recording = read_trial(paths, vessel, **(reader or {}))
-    # what no later step can tell from a large angle
+    # what no later step can tell from a large angle, or from a wrong column
     degrees = angle_unit_findings(recording, vessel)
     lines = [f"note: {f.evidence}; {f.fix}" for f in degrees]
     return _write(recording, vessel, out, options, extra, lines)
@@ -231,6 +236,14 @@ def _write(
     imported = _with_actuators(import_recording(recording, vessel, options), recording, vessel)
     write_log(imported.segments, out, extra=extra)
     first, last = imported.segments[0], imported.segments[-1]
+    apart = max((float(b.t[0] - a.t[-1]) for a, b in pairwise(imported.segments)), default=0.0)
+    if len(recording.files) > 1 and apart > _ANOTHER_TRIAL:
+        lines = [
+            *lines,
+            f"note: {len(recording.files)} files with {apart / 3600:.3g} h between them became one "
+            f"log: if each is of a trial of its own, name a folder, such as --out {out.stem}/, to "
+            f"write one log each",
+        ]
     return _summary(
         first,
         sum(len(s) for s in imported.segments),

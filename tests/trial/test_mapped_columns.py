@@ -132,3 +132,38 @@ def test_nothing_is_missed_where_another_column_serves(tmp_path, there):
     ship = vessel({"tvec": "t", "yaw": "psi", "north": "x_n", "east": "y_n"})
     notes = imported(tmp_path, ship, table(**there)).provenance.read
     assert any("which no file has" in n for n in notes) is not bool(there)
+
+
+@pytest.mark.parametrize(
+    ("column", "to", "message"),
+    [
+        ("Propeller rpm", "d", "is in 'rpm', and .* to 'd', which is an angle: wrong column?"),
+        ("Rudder [deg]", "n", "is in 'deg', and .* to 'n', which is a propeller speed: wrong"),
+        ("Rudder [rpm]", "d", "which is an angle: wrong column?"),
+    ],
+)
+def test_a_unit_that_a_thruster_column_cannot_have_is_refused(tmp_path, column, to, message):
+    thruster = {"type": "propeller_rudder", "speed": "n", "rudder": "d"}
+    ship = {"name": "V", "length": 10, "thruster": [thruster], "columns": {column: to}}
+    frame = table(**{column: 5 + 0 * T})
+    with pytest.raises(LogError, match=message):
+        imported(tmp_path, vessel_from_dict(ship), frame)
+
+
+def test_endings_that_are_words_of_a_name_are_no_units(tmp_path):
+    thruster = {"type": "propeller_rudder", "speed": "n", "rudder": "d"}
+    columns = {"tvec": "t", "yaw": "psi", "rudder_s": "d"}
+    ship = {"name": "V", "length": 10, "thruster": [thruster], "columns": columns}
+    log = imported(tmp_path, vessel_from_dict(ship), table(rudder_s=0.1 + 0 * T))
+    np.testing.assert_allclose(log["d"], 0.1)
+
+
+@pytest.mark.parametrize(("apart", "noted"), [(200.0, False), (7200.0, True)])
+def test_trials_of_several_days_in_one_log_are_noted(tmp_path, apart, noted):
+    files = [tmp_path / f"day{k}.csv" for k in range(2)]
+    for k, file in enumerate(files):
+        table(t=1.6e9 + k * apart + 10 * T).drop(columns="tvec").to_csv(file, index=False)
+    ship = vessel({"yaw": "psi"})
+    text = import_files(files, ship, tmp_path / "log.csv")
+    assert ("h between them became one log" in text) == noted
+    assert ("name a folder, such as --out log/, to write one log each" in text) == noted

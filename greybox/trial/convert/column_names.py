@@ -156,6 +156,8 @@ def assign(
                 f"columns '{found[name].raw}' and '{raw}' are both there, and [columns] maps both "
                 f"to '{name}': remove one of the two lines from the vessel file."
             )
+        if mapping.unit is None and name in vessel.recorded_columns:
+            _require_fitting(raw, name, vessel.unit(name), units)
         unit = mapping.unit or _mapped_unit(raw, vessel.unit(name), units)
         # without a unit it promises what the canonical name does
         how = "mapped" if mapping.unit else "exact"
@@ -253,6 +255,24 @@ def _mapped_unit(raw: str, target: str | None, units: Mapping[str, str]) -> str 
     if unit == "ms" and target == "m/s":
         return "m/s"
     return unit if unit is not None and target is not None and _fits(unit, target) else target
+
+
+def _require_fitting(raw: str, name: str, target: str | None, units: Mapping[str, str]) -> None:
+    """Refuse a column of a thruster whose stated unit such a column cannot have."""
+    stated = units.get(raw, _without_brackets(raw)[1])
+    ending = split_unit(raw)[1]
+    # other endings may be words of a name, as the s of starboard
+    unit = stated or (ending if ending in ("rpm", "rps", "deg", "rad") else None)
+    if unit is None:
+        return
+    try:
+        unit_factor(unit, target, raw)
+    except LogError:
+        kind = "a propeller speed" if target is None else "an angle"
+        raise LogError(
+            f"column '{raw}' is in '{unit}', and [columns] maps it to '{name}', which is {kind}: "
+            f"wrong column? Map another one, or state its unit there."
+        ) from None
 
 
 def _pointless(name: str, found: Mapping[str, Assigned]) -> bool:
