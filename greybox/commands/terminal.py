@@ -8,6 +8,7 @@ import re
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 
 LOGGERS = ("greybox", "experiment_design")
+_log = logging.getLogger(__name__)
 _QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
 _VERDICT = r"(?m)^((?:[Vv]erdict|Prediction|Coefficients): )(do not trust|trust except|\w+)"
 # red and green; other verdicts are yellow
@@ -186,6 +188,9 @@ def telling(verbose: int, quiet: bool, stages: Sequence[Stage] = ()) -> Iterator
             undo.callback(logger.removeHandler, teller)
             logger.addHandler(teller)
             logger.setLevel(logging.DEBUG if verbose > 1 else logging.INFO)
+        # of a warning the user would see a line of this program
+        undo.enter_context(warnings.catch_warnings())
+        warnings.showwarning = lambda message, *_, **__: _log.info("%s", message)
         undo.callback(_QUIET.reset, _QUIET.set(quiet))
         undo.callback(_left.reset, _left.set(TimeLeft(stages)))
         main = threading.current_thread() is threading.main_thread()

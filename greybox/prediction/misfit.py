@@ -101,6 +101,12 @@ def _sizes(of: object, states: tuple[str, ...]) -> Array:
     return np.array([float("nan") if known.get(s) is None else known[s] for s in states], float)
 
 
+def _mean_of_numbers(power: Array) -> Array:
+    """Return the mean of each row over the runs that have one, nan where none has."""
+    has = np.isfinite(power).all(axis=0)
+    return power[:, has].mean(axis=1) if has.any() else np.full(len(power), np.nan)
+
+
 @dataclass(frozen=True)
 class Misfit:
     """Smooth random functions of motion and commands, one of each state and run.
@@ -228,11 +234,13 @@ def misfit_of(
     )  # fmt: skip
     where = [("u", "v", "r").index(s) for s in model.structure.states]
     moved = runs.states[runs.order :, where]
-    power = np.mean((moved - moved[:, :, :1]) ** 2, axis=0)
-    power[:, runs.diverged] = np.nan
+    # squares of runs that diverged are no numbers
+    kept = ~runs.diverged
+    power = np.full(moved.shape[1:], np.nan)
+    power[:, kept] = np.mean((moved[:, :, kept] - moved[:, :, :1]) ** 2, axis=0)
     groups = np.split(power[:, 1:], _DRAWS * np.arange(1, nx + 1), axis=1)
-    response = np.column_stack([np.nanmean(g, axis=1) for g in groups[:nx]])
-    known = np.nanmean(groups[nx], axis=1) if len(drawn) else np.zeros(nx)
+    response = np.column_stack([_mean_of_numbers(g) for g in groups[:nx]])
+    known = _mean_of_numbers(groups[nx]) if len(drawn) else np.zeros(nx)
     wanted = errors.rmse**2
     scale = np.where(wanted > 0, wanted, 1.0)
     if not np.isfinite(response).all():

@@ -60,6 +60,25 @@ def on_the_screen(shown: str) -> str:
     return "\n".join(lines)
 
 
+def test_a_warning_is_no_line_of_the_program_on_the_terminal():
+    script = (
+        "import numpy as np\n"
+        "from greybox.commands.terminal import telling\n"
+        "with telling({}, False):\n"
+        "    np.float64(1e300) ** 2\n"
+    )
+    shown = [
+        subprocess.run(
+            [sys.executable, "-c", script.format(verbose)], capture_output=True, text=True,
+            cwd=ROOT, check=True,
+        ).stderr
+        for verbose in (0, 1)
+    ]  # fmt: skip
+    assert shown[0] == ""
+    assert "overflow encountered" in shown[1]
+    assert ".py" not in shown[1]
+
+
 def test_progress_shows_and_clears():
     status, shown = on_a_terminal("-c", SCRIPT)
     assert status == 0

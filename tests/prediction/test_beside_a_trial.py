@@ -202,6 +202,16 @@ def test_what_runs_on_other_logs_missed_is_in_the_intervals_of_one_manoeuvre():
     assert "by how far its free runs were off on held-out logs" in " ".join(made.notes)
 
 
+def test_draws_that_leave_every_bound_do_not_warn_where_the_misfit_is_sized():
+    model = judged_model(0.05, judged_on="validation")
+    covariance = np.zeros_like(model.covariance)
+    i = model.names.index("X_|u|u*rudder_drag")
+    covariance[i, i] = (20 * model.theta[i]) ** 2
+    model = replace(model, covariance=covariance)
+    (turn,) = predict_manoeuvre(model, "turning", side="port", **FEW).manoeuvres
+    assert turn.diverged
+
+
 @pytest.mark.long
 def test_intervals_are_as_wide_as_runs_on_other_logs_missed():
     asked = {"side": "starboard", "angles": [20 * DEG]} | FEW
