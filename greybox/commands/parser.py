@@ -39,6 +39,34 @@ class Formatter(RawDescriptionRichHelpFormatter):
         return kept._rich_fill_text(self, text, width, indent)
 
 
+class _StoreAction(argparse._StoreAction):
+    """Keeps the value of an option; of one that takes several, those of each repetition."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Keep what was typed, and refuse a second value where one is meant."""
+        if isinstance(parser, Parser) and option_string:
+            before = getattr(namespace, self.dest) if self.dest in parser.given else None
+            parser.given.add(self.dest)
+            if before is not None and self.nargs in ("+", "*"):
+                values = [*before, *values]
+            elif before is not None and before != values:
+                parser.error(
+                    f"{option_string} is given twice, {_as_typed(before)} and "
+                    f"{_as_typed(values)}: keep one of them"
+                )
+        setattr(namespace, self.dest, values)
+
+
+def _as_typed(value: Any) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list | tuple) else f"{value}"
+
+
 def sub_parsers(parser: argparse.ArgumentParser) -> dict[str, Parser]:
     """Return the parsers of the sub-commands by name."""
     found = [a.choices for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
@@ -56,6 +84,14 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *given: Any, **named: Any) -> None:
         usual = {"formatter_class": partial(Formatter, max_help_position=26)}
         super().__init__(*given, **usual | named)
+        # what `add_argument` makes where it is told no action
+        self.register("action", None, _StoreAction)
+        self.given: set[str] = set()
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse as usual; what was given before is forgotten."""
+        self.given = set()
+        return super().parse_known_args(args, namespace)
 
     def short_usage(self) -> str:
         """Return how a command is typed, its many options in one word."""

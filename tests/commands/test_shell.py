@@ -160,6 +160,52 @@ def test_wrong_usage_is_one_sentence_with_the_nearest_name(capsys, line, message
 
 
 @pytest.mark.parametrize(
+    ("line", "name", "values"),
+    [
+        ("compare m.json --log a.csv --log b.csv c.csv", "log", ["a.csv", "b.csv", "c.csv"]),
+        ("predict m.json zigzag --angle 10 --angle 20/10", "angle", ["10", "20/10"]),
+        ("design --vessel V --out p.csv --want Xu --want Yv", "want", ["Xu", "Yv"]),
+        ("predict m.json turning", "angle", []),
+        ("estimate a.csv --vessel V --validate b.csv --validate c.csv", "validate",
+         ["b.csv", "c.csv"]),
+        ("estimate a.csv --vessel V --seed 3 --seed 3", "seed", 3),
+    ],
+)  # fmt: skip
+def test_an_option_that_takes_several_adds_up_when_it_is_repeated(line, name, values):
+    parser = build_parser()
+    # twice: what a line gave is no part of the next
+    for _ in range(2):
+        assert getattr(parser.parse_args(line.split()), name) == values
+
+
+def test_options_that_take_several_all_add_up():
+    for name, parser in COMMANDS.items():
+        for action in own_actions(parser):
+            if action.option_strings and action.nargs in ("+", "*"):
+                values = [str((action.choices or ["x", "y"])[k]) for k in (0, 1)]
+                option = action.option_strings[-1]
+                alone = parser.for_parts()
+                both = vars(alone.parse_args([option, values[0], option, values[1]]))
+                assert both[action.dest] == values, f"{name} {option}"
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("estimate a.csv --vessel V --seed 0 --seed 1", "--seed is given twice, 0 and 1: keep one"),
+        ("design --vessel a --vessel b --out p.csv", "--vessel is given twice, a and b: keep one"),
+        ("design --vessel a --out p --between a b --between c d",
+         "--between is given twice, a b and c d: keep one"),
+    ],
+)  # fmt: skip
+def test_a_second_value_where_one_is_meant_is_refused(capsys, line, message):
+    with pytest.raises(SystemExit) as stopped:
+        main(line.split())
+    assert stopped.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("line", "message"),
     [
         ("check trail.csv --vessel ship.toml", "Did you mean 'trial.csv'?"),
