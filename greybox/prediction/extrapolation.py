@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,20 +27,28 @@ class Extrapolation:
         Least and greatest value in the run, and in the logs [m/s, rad, rad/s, as logged].
     angle : bool
         Whether it is an angle or its rate.
+    since : float
+        When it first left its range, from the order on [s]; negative in the approach.
     """
 
     signal: str
     run: tuple[float, float]
     known: tuple[float, float]
     angle: bool
+    since: float = 0.0
+
+    @property
+    def shown(self) -> tuple[float, str]:
+        """What its values are multiplied by where they are shown, and the unit."""
+        unit = {"u": " m/s", "v": " m/s", "r": " deg/s"}.get(
+            self.signal, " deg" if self.angle else ""
+        )
+        return 180 / math.pi if self.angle else 1.0, unit
 
     @property
     def sentence(self) -> str:
         """Both ranges in words."""
-        factor = 180 / math.pi if self.angle else 1.0
-        unit = {"u": " m/s", "v": " m/s", "r": " deg/s"}.get(
-            self.signal, " deg" if self.angle else ""
-        )
+        factor, unit = self.shown
         (least, most), (low, high) = self.run, self.known
         spread = f"is {least * factor:z.3g}{unit}"
         if most > least:
@@ -52,7 +60,9 @@ class Extrapolation:
         )
 
 
-def extrapolations(model: ManoeuvringModel, log: TrialLog) -> tuple[Extrapolation, ...] | None:
+def extrapolations(
+    model: ManoeuvringModel, log: TrialLog, order_time: float
+) -> tuple[Extrapolation, ...] | None:
     """Return the signals that leave their ranges in the estimation logs.
 
     Parameters
@@ -61,6 +71,8 @@ def extrapolations(model: ManoeuvringModel, log: TrialLog) -> tuple[Extrapolatio
         Its record holds the ranges where `estimate` wrote them.
     log : TrialLog
         Of the predicted run.
+    order_time : float
+        When its manoeuvre was ordered [s].
 
     Returns
     -------
@@ -77,9 +89,22 @@ def extrapolations(model: ManoeuvringModel, log: TrialLog) -> tuple[Extrapolatio
             continue
         least, most = float(np.min(log[name])), float(np.max(log[name]))
         slack = max(_SLACK * (high - low), _NEAR * max(abs(low), abs(high)))
-        if least < low - slack or most > high + slack:
-            found.append(Extrapolation(name, (least, most), (low, high), name in angles))
+        outside = (log[name] < low - slack) | (log[name] > high + slack)
+        if outside.any():
+            since = float(log.t[np.argmax(outside)]) - order_time
+            known_to = low, high
+            found.append(Extrapolation(name, (least, most), known_to, name in angles, since))
     return tuple(found)
+
+
+def of_all(found: Sequence[Extrapolation]) -> tuple[Extrapolation, ...]:
+    """Return one extrapolation a signal, from the least to the greatest value of all runs."""
+    made: dict[str, Extrapolation] = {}
+    for one in found:
+        other = made.get(one.signal, one)
+        run = min(one.run[0], other.run[0]), max(one.run[1], other.run[1])
+        made[one.signal] = replace(one, run=run, since=min(one.since, other.since))
+    return tuple(made.values())
 
 
 def extrapolation_notes(found: Sequence[Extrapolation] | None) -> tuple[str, ...]:

@@ -94,6 +94,29 @@ def quantities(of: Manoeuvre) -> dict[str, Quantity | None]:
     }
 
 
+def known_from(of: Manoeuvre) -> dict[str, float]:
+    """Return the time from the order until which a run determines each quantity [s].
+
+    Those that the whole manoeuvre determines have none.
+    """
+    times: dict[str, Quantity | float | None] = {"approach_speed": 0.0}
+    if isinstance(of, TurningCircle):
+        times |= dict.fromkeys(("advance", "transfer", "time_90"), of.time_90)
+        times |= dict.fromkeys(("tactical_diameter", "time_180"), of.time_180)
+        times |= {"time_360": of.time_360}
+    elif isinstance(of, ZigZag):
+        times |= dict.fromkeys(("initial_turning", "initial_turning_time"), of.initial_turning_time)
+        times |= {"reach": of.reach}
+        executes = [e - of.start for e in of.executes]
+        for nth, execute, check in zip(
+            ("first", "second"), executes[1:], of.check_times, strict=False
+        ):
+            times |= {f"{nth}_{n}": execute + check.value for n in ("overshoot", "check_time")}
+        if of.period is not None:
+            times["period"] = executes[3]
+    return {n: t.value if isinstance(t, Quantity) else t for n, t in times.items() if t is not None}
+
+
 def measure(
     runs: DrawnRuns,
     run: int,

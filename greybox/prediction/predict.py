@@ -22,7 +22,7 @@ from greybox.prediction.conditions import (
 )
 from greybox.prediction.extrapolation import extrapolations
 from greybox.prediction.helm import ROUNDED, Helm, find_helm
-from greybox.prediction.measuring import measure, quantities
+from greybox.prediction.measuring import known_from, measure, quantities
 from greybox.prediction.misfit import held_out_errors, misfit_of
 from greybox.prediction.monte_carlo import MonteCarloQuantity, over_draws
 from greybox.prediction.notes import (
@@ -416,7 +416,10 @@ def _one(
         for i, name in enumerate(helm.columns)
     }
     log = log_of(runs, 0, model, helm)
-    beyond = extrapolations(model, log)
+    order_time = float(runs.t[runs.order])
+    beyond = extrapolations(model, log, order_time)
+    since, until = min((e.since for e in beyond or ()), default=math.inf), known_from(own)
+    resting = tuple(n for n in values if since < until.get(n, math.inf))
     return PredictedManoeuvre(
         kind,
         task.side,
@@ -425,7 +428,7 @@ def _one(
         _label(kind, helm, task, asked),
         {n: q for n, q in commands.items() if q is not None},
         values,
-        _criteria(own, values, model.vessel.length),
+        _criteria(own, values, model.vessel.length, resting),
         asked.draws,
         int(runs.diverged[1:].sum()),
         int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum()),
@@ -437,9 +440,10 @@ def _one(
             ),
         ),
         log,
-        float(runs.t[runs.order]),
+        order_time,
         bundle_of(runs, helm, task.course, model.vessel.length),
         extrapolated=beyond or (),
+        resting=resting,
     )
 
 
@@ -491,9 +495,12 @@ def _process(model: ManoeuvringModel, asked: Conditions, runs: int) -> Push:
 
 
 def _criteria(
-    own: Manoeuvre, values: Mapping[str, MonteCarloQuantity | None], length: float
+    own: Manoeuvre,
+    values: Mapping[str, MonteCarloQuantity | None],
+    length: float,
+    resting: Sequence[str],
 ) -> tuple[Criterion, ...]:
-    """Judge the limits that apply by the intervals of the draws."""
+    """Judge the limits that apply by the intervals of the draws, where logs speak for them."""
     made = []
     unsteered = isinstance(own, TurningCircle) and own.rudder is None
     for criterion in own.criteria:
@@ -512,6 +519,8 @@ def _criteria(
         if judged.verdict is Compliance.PASS and not value.certain:
             reason = f"{value.reached} of {value.draws} draws reach it"
             judged = replace(judged, verdict=Compliance.OPEN, reason=reason)
+        if CRITERIA.get(criterion.name) in resting:
+            judged = replace(judged, verdict=Compliance.OPEN)
         made.append(judged)
     return tuple(made)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from greybox.estimation.prediction_verdict import PredictionLevel
 from greybox.estimation.verdict import TrustLevel
 from greybox.notebook import DisplayMixin, items, number, table
-from greybox.prediction.extrapolation import Extrapolation
+from greybox.prediction.extrapolation import Extrapolation, of_all
 from greybox.prediction.measuring import LABELS
 from greybox.prediction.monte_carlo import MonteCarloQuantity
 from greybox.trial.log import TrialLog
@@ -154,6 +154,8 @@ class PredictedManoeuvre:
     agreement : Agreement or None
     extrapolated : tuple of Extrapolation
         Signals that leave their ranges in the estimation logs.
+    resting : tuple of str
+        Quantities that rest on what the run does from then on.
     """
 
     kind: Kind
@@ -174,6 +176,7 @@ class PredictedManoeuvre:
     bundle: Bundle
     agreement: Agreement | None = None
     extrapolated: tuple[Extrapolation, ...] = ()
+    resting: tuple[str, ...] = ()
 
     @property
     def length(self) -> float:
@@ -183,6 +186,20 @@ class PredictedManoeuvre:
     def criterion(self, name: str) -> Criterion | None:
         """Return the criterion on a quantity, None where there is none."""
         return next((c for c in self.criteria if CRITERIA.get(c.name) == name), None)
+
+    def verdict_word(self, criterion: Criterion) -> str:
+        """Return the verdict on a limit as it reads, where no log speaks for it with the reason."""
+        said = WORDS[criterion.verdict]
+        rests = criterion.limit is not None and CRITERIA.get(criterion.name) in self.resting
+        return f"extrapolated: {said}" if rests else said
+
+    def verdict_line(self, criterion: Criterion) -> str:
+        """Return limit, verdict and reason of a criterion in one line."""
+        word, limit = self.verdict_word(criterion), limit_words(criterion)
+        if not limit:
+            return f"{criterion.name}: {word}, because {criterion.reason}"
+        note = f" ({criterion.reason})" if criterion.reason else ""
+        return f"{criterion.name}, at most {limit}: {word}{note}"
 
     def summary(self) -> str:
         """Return values, verdicts, agreement and notes as text."""
@@ -197,12 +214,15 @@ class PredictedManoeuvre:
             if value is None:
                 lines.append(f"  {LABELS[name]:<26}not reached")
                 continue
-            lines.append(f"  {LABELS[name]:<26}{value.text(self.length)}")
-        lines += [f"  IMO {verdict_line(c)}" for c in self.criteria]
+            mark = "  extrapolated" if name in self.resting else ""
+            lines.append(f"  {LABELS[name]:<26}{value.text(self.length)}{mark}")
+        lines += [f"  IMO {self.verdict_line(c)}" for c in self.criteria]
         if self.agreement is not None:
             lines.append(f"  trial: {self.agreement.sentence}")
             lines += [f"    {compared_line(c, self.length)}" for c in self.agreement.rows]
-        lines += [f"  note: {n}" for n in self.notes]
+        # the prediction begins with them
+        told = {e.sentence for e in self.extrapolated}
+        lines += [f"  note: {n}" for n in self.notes if n not in told]
         return "\n".join(lines)
 
     def to_list(self) -> list[dict[str, Any]]:
@@ -221,6 +241,7 @@ class PredictedManoeuvre:
                 "ci": None if value is None else list(value.interval),
                 "unit": None if value is None else value.unit,
                 "draws": 0 if value is None else value.reached,
+                "extrapolated": name in self.resting,
                 "criterion": None,
                 "verdict": None,
             }
@@ -286,13 +307,26 @@ class ManoeuvrePrediction(DisplayMixin):
     prediction: PredictionLevel = PredictionLevel.NOT_JUDGED
     instant: tuple[str, ...] = ()
 
+    @property
+    def extrapolated(self) -> tuple[Extrapolation, ...]:
+        """Signals that leave their ranges in the estimation logs, those of all manoeuvres."""
+        return of_all([e for m in self.manoeuvres for e in m.extrapolated])
+
     def summary(self) -> str:
         """Return all manoeuvres as text."""
         title = TITLES[self.kind].capitalize()
+        beyond = [e.sentence for e in self.extrapolated]
+        if beyond:
+            beyond.append(
+                "no log speaks for the rows that are marked 'extrapolated': their intervals may be "
+                "too narrow."
+            )
+        told = {e.sentence for m in self.manoeuvres for e in m.extrapolated}
         lines = [
             f"{title} of {self.vessel}, predicted; 95 % intervals from {self.draws} draws",
+            *beyond,
             self.steering,
-            *[f"note: {n}" for n in self.notes],
+            *[f"note: {n}" for n in self.notes if n not in told],
         ]
         return "\n\n".join(["\n".join(lines), *[m.summary() for m in self.manoeuvres]])
 
@@ -347,15 +381,6 @@ def limit_words(criterion: Criterion) -> str:
         return ""
     angle = criterion.measured is not None and criterion.measured.unit == "rad"
     return f"{math.degrees(criterion.limit):.1f} deg" if angle else f"{criterion.limit:g} L"
-
-
-def verdict_line(criterion: Criterion) -> str:
-    """Return limit, verdict and reason of a criterion in one line."""
-    word, limit = WORDS[criterion.verdict], limit_words(criterion)
-    if not limit:
-        return f"{criterion.name}: {word}, because {criterion.reason}"
-    note = f" ({criterion.reason})" if criterion.reason else ""
-    return f"{criterion.name}, at most {limit}: {word}{note}"
 
 
 def compared_line(row: Compared, length: float) -> str:

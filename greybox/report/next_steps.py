@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from greybox.channels import MOTION_WORDS
 from greybox.estimation.prediction_verdict import PredictionLevel
 from greybox.estimation.verdict import TrustLevel
 
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 _MOST_TYPED = 3
 # what logs are files of
 _TABLES = {"CSV", "Parquet"}
+# angle from which on next steps round it [deg]
+_WHOLE = 10.0
 _DOUBTED = (PredictionLevel.LIMITED, PredictionLevel.POOR)
 
 
@@ -215,15 +218,51 @@ def after_comparison(
     )
 
 
+def _within_the_logs(made: ManoeuvrePrediction, model: str) -> list[NextStep]:
+    """Return what to do where a prediction goes beyond the logs of its model."""
+    import math
+
+    ship = made.manoeuvres[0].log.vessel
+    orders = [abs(m.order) for m in made.manoeuvres if m.order is not None and m.extrapolated]
+    beyond = made.extrapolated
+    steered = [e for e in beyond if e.signal in ship.angle_commands] if orders else []
+    for e in steered:
+        known = math.degrees(min(abs(bound) for bound in e.known))
+        # a whole degree may lie as far beyond as counts as known
+        angle = f"{round(known) if known >= _WHOLE else math.floor(10 * known) / 10:g}"
+        asked = f"{math.degrees(max(orders)):.3g}"
+        turn = {"turning": "turn", "zigzag": "zig-zag"}[made.kind]
+        if 0 < float(angle) < float(asked):
+            return [
+                NextStep(
+                    f"Your logs go to {angle} deg of {e.signal}: sail a {asked} deg {turn} and "
+                    f"estimate with its log too, or predict what they hold",
+                    f"greybox predict {model} {made.kind} --angle {angle}",
+                )
+            ]
+    told = []
+    for e in beyond:
+        factor, unit = e.shown
+        low, high = (f"{bound * factor:.3g}" for bound in e.known)
+        told.append(f"{low} to {high}{unit} of {MOTION_WORDS.get(e.signal, e.signal)}")
+    return [
+        NextStep(
+            f"Your logs hold {' and '.join(told)}: sail this manoeuvre, or another that goes as "
+            f"far, and estimate with its log too"
+        )
+    ] * bool(told)
+
+
 def after_prediction(
     made: ManoeuvrePrediction, record: dict[str, Any], vessel: str
 ) -> list[NextStep]:
     """Return what makes the prediction surer, or puts it to the test."""
+    from greybox.prediction.result import CRITERIA
     from greybox.trial.manoeuvres import Compliance
 
     model = typed(record, "model", "MODEL")
     agreements = [m.agreement for m in made.manoeuvres if m.agreement is not None]
-    steps = []
+    steps = _within_the_logs(made, model)
     if made.instant:
         ship = made.manoeuvres[0].log.vessel
         rates = dict.fromkeys(
@@ -238,7 +277,11 @@ def after_prediction(
                 f"that model: orders of {', '.join(made.instant)} act at once in this one"
             )
         )
-    if any(c.verdict is Compliance.OPEN for m in made.manoeuvres for c in m.criteria):
+    if any(
+        c.verdict is Compliance.OPEN and CRITERIA.get(c.name) not in m.resting
+        for m in made.manoeuvres
+        for c in m.criteria
+    ):
         steps.append(
             NextStep(
                 "Plan a trial that narrows these intervals",

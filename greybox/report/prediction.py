@@ -15,11 +15,9 @@ from greybox.prediction.measuring import LABELS
 from greybox.prediction.monte_carlo import MonteCarloQuantity
 from greybox.prediction.result import (
     TITLES,
-    WORDS,
     ManoeuvrePrediction,
     PredictedManoeuvre,
     limit_words,
-    verdict_line,
 )
 from greybox.report.figures import (
     BLACK,
@@ -128,7 +126,7 @@ def _section(made: PredictedManoeuvre, key: str) -> Section:
         sentences=sentences,
         pictures=_pictures(made, key),
         tables=tables,
-        points=[*[capital(f"IMO {verdict_line(c)}.") for c in made.criteria],
+        points=[*[capital(f"IMO {made.verdict_line(c)}.") for c in made.criteria],
                 *map(capital, made.notes)],
     )  # fmt: skip
 
@@ -146,8 +144,9 @@ def _values(made: PredictedManoeuvre) -> Table:
         criterion = made.criterion(name)
         limit = verdict = ""
         if criterion is not None:
-            limit, verdict = limit_words(criterion), WORDS[criterion.verdict]
-        rows.append([LABELS[name], *_cells(value, made.length), limit, verdict])
+            limit, verdict = limit_words(criterion), made.verdict_word(criterion)
+        said = f"{LABELS[name]} (extrapolated)" if name in made.resting else LABELS[name]
+        rows.append([said, *_cells(value, made.length), limit, verdict])
     return Table(
         "Predicted, with intervals of 95 %",
         ["quantity", "value", "in lengths", "95 %", "at most", "IMO MSC.137(76)"],

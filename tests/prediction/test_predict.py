@@ -327,8 +327,47 @@ def test_leaving_the_range_of_the_logs_is_said():
     assert len(told) == 1
     assert "yaw rate goes from" in told[0]
     assert "estimated on -1.15 to 1.15 deg/s" in told[0]
+    # the terminal begins with it, and says it once
+    shown = made.summary().splitlines()
+    assert shown[1] == told[0]
+    assert made.summary().count("extrapolated: ") == 1 + len(made.manoeuvres[0].criteria)
     silent = predict_manoeuvre(replace(model, record={}), "turning", side="port", **FEW)
     assert any("does not say on what motions" in n for n in silent.notes)
+
+
+def test_rows_from_where_the_run_leaves_the_logs_rest_on_no_log():
+    """The helm is at once beyond its range, and the ship slower than in the logs at the end."""
+    ranges = {"r": (-1.0, 1.0), "u": (0.0, 9.0), "v": (-9.0, 9.0), "n": (0.0, 15.0)}
+    near = {"delta": (-math.radians(28), math.radians(28))}
+    whole = {"delta": (-1.0, 1.0)}
+    made = {}
+    for name, more in (("helm", near), ("speed", whole | {"u": (2.3, 2.5)}), ("none", whole)):
+        model = replace(rudder_model(step=0.25), record={"ranges": ranges | more})
+        made[name] = predict_manoeuvre(model, "turning", side="starboard", **FEW)
+    rows = {n: {r["name"]: r for r in m.to_dict()["quantities"]} for n, m in made.items()}
+    flags = {n: {k for k, r in found.items() if r["extrapolated"]} for n, found in rows.items()}
+    assert flags["none"] == set()
+    assert flags["helm"] == set(rows["helm"]) - {"approach_speed"}
+    assert {"steady_speed", "speed_loss"} <= flags["speed"] < flags["helm"] - {"advance"}
+
+    assert rows["none"]["tactical_diameter"]["verdict"] == "meets"
+    assert rows["helm"]["tactical_diameter"]["verdict"] == "cannot be told"
+    shown = made["helm"].summary()
+    assert "IMO tactical diameter, at most 5 L: extrapolated: cannot be told" in shown
+    assert "  steady speed " in shown
+    assert "cannot be told" in headline(made["helm"])
+
+    record = {"command": {"model": "m.json"}}
+    step = after_prediction(made["helm"], record, "V")[0]
+    assert step.line() == (
+        "next: your logs go to 28 deg of delta: sail a 35 deg turn and estimate with its log too, "
+        "or predict what they hold: greybox predict m.json turning --angle 28"
+    )
+    assert (
+        "your logs hold 2.3 to 2.5 m/s of surge"
+        in after_prediction(made["speed"], record, "V")[0].line()
+    )
+    assert not any("your logs" in s.line() for s in after_prediction(made["none"], record, "V"))
 
 
 def trial_of(made, rng, share=1.0):
