@@ -108,7 +108,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     approach.add_argument(
         "--current",
         action="store_true",
-        help="predict in the model's current; by default in still water",
+        help="predict in the model's current; by default in still water, and with --trial in the "
+        "current that the trial or the model tells",
+    )
+    approach.add_argument(
+        "--still-water",
+        action="store_true",
+        help="predict in still water and air, also with --trial",
     )
     approach.add_argument(
         "--no-limits",
@@ -176,7 +182,7 @@ def run(options: argparse.Namespace) -> None:
         astern=options.astern,
         until=options.until,
         limited=not options.no_limits,
-        current=options.current,
+        current=_current(options),
         course=math.radians(options.course),
         disturbed=options.disturbed,
         scale=options.scale,
@@ -207,6 +213,15 @@ def run(options: argparse.Namespace) -> None:
     result = made.to_dict() | {"provenance": record}
     steps = after_prediction(made, record, vessel)
     publish(options, result, made.summary(), page, steps, written)
+
+
+def _current(options: argparse.Namespace) -> bool | None:
+    """Return whether the model's current acts; None leaves it to the trial."""
+    from greybox.errors import UsageError
+
+    if options.current and options.still_water:
+        raise UsageError("--current and --still-water exclude one another: keep one of them.")
+    return True if options.current else False if options.still_water else None
 
 
 def _angle(text: str) -> float | tuple[float, float]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from greybox.estimation.prediction_verdict import PredictionLevel
 from greybox.estimation.verdict import TrustLevel
@@ -24,6 +25,8 @@ from greybox.trial.log import TrialLog
 from greybox.trial.manoeuvres import Stopping, TurningCircle, ZigZag
 from greybox.trial.manoeuvres.finding import Manoeuvre
 from greybox.trial.wind import true_wind
+
+Array = NDArray[np.float64]
 
 
 def instant_orders(kind: Kind, model: ManoeuvringModel, helm: Helm) -> list[str]:
@@ -168,8 +171,13 @@ def trial_notes(
     own_start: bool,
     windy: bool,
     current: TrialCurrent | None,
+    usual: Array | None = None,
 ) -> list[str]:
-    """Say what the run took from the trial, and where its commands are others."""
+    """Say what the run took from the trial, and where its commands are others.
+
+    `usual` is the model's current, north and east [m/s], where the run is sailed in it unless the
+    trial tells its own.
+    """
     run = found.length / max(found.approach_speed.value, 1e-9)
     k = (log.t >= found.start - run) & (log.t < found.start)
     told = []
@@ -184,6 +192,12 @@ def trial_notes(
         )
     if current is not None:
         told.append(current.sentence)
+    elif usual is not None and usual.any():
+        towards = math.degrees(math.atan2(usual[1], usual[0])) % 360
+        told.append(
+            f"sailed in the model's current, {math.hypot(*usual):.2g} m/s towards {towards:.0f} "
+            f"deg, as the trial does not tell its own (--still-water leaves it out)."
+        )
     if isinstance(found, TurningCircle) and found.slowed:
         told.append(found.slowed)
     if own_start:

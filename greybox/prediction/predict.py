@@ -93,7 +93,7 @@ def predict_manoeuvre(
     astern: float | None = None,
     until: float | None = None,
     limited: bool = True,
-    current: bool = False,
+    current: bool | None = None,
     course: float = 0.0,
     disturbed: bool = False,
     scale: float = 1.0,
@@ -134,8 +134,9 @@ def predict_manoeuvre(
         Share of the approach speed at which a stop ends: 0.2 without thrust, 0 astern.
     limited : bool
         Whether commands keep the ranges of the vessel file; rates hold anyway.
-    current : bool
-        Whether the model's current and wind act; still water and air by default.
+    current : bool, optional
+        Whether the model's current and wind act. By default they do beside a trial that does
+        not tell its own current, else the water and the air are still.
     course : float
         Heading of the approach, which matters in a current [rad].
     disturbed : bool
@@ -170,6 +171,8 @@ def predict_manoeuvre(
         given: Mapping[str, float] = {}
     else:
         given = command if isinstance(command, Mapping) else {"": float(command)}
+    if current is None:
+        current = trial is not None and any(model.d)
     asked = Conditions(
         tuple((a, None) if isinstance(a, int | float) else (a[0], a[1]) for a in angles),
         side,
@@ -225,6 +228,7 @@ def predict_manoeuvre(
                 own_start=as_in_trial(asked),
                 windy=wind_of(model, measured, log) is not None,
                 current=flow,
+                usual=model.d[WHERE_CURRENT] if asked.current and model.disturbances else None,
             )  # fmt: skip
             predicted = replace(predicted, agreement=agreement, notes=(*predicted.notes, *told))
         made.append(predicted)

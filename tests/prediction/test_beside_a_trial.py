@@ -141,6 +141,23 @@ def test_a_turn_is_sailed_in_the_current_of_its_trial():
     assert not any("current" in n for n in calm.notes)
 
 
+def test_a_trial_that_does_not_tell_its_current_is_sailed_in_the_models():
+    current = {"current_north": (0.2, 0.01), "current_east": (-0.3, 0.01)}
+    model = replace(rudder_model(step=STEP), disturbances=current)
+    asked = {"side": "starboard", "angles": [20 * DEG]} | FEW
+    log = predict_manoeuvre(model, "zigzag", current=True, **asked).manoeuvres[0].log
+    made = predict_manoeuvre(model, "zigzag", trial=log, draws=40)
+    told = "sailed in the model's current, 0.36 m/s towards 304 deg"
+    assert any(n.startswith(told) for n in made.notes)
+    still = predict_manoeuvre(model, "zigzag", trial=log, draws=40, current=False)
+    assert not any("model's current" in n for n in still.notes)
+    assert max(errors(made).values()) < 0.07
+    assert max(errors(still).values()) > 0.15
+    # without a trial the water is still
+    alone = predict_manoeuvre(model, "zigzag", **asked)
+    assert not any("model's current" in n for n in alone.notes)
+
+
 def test_a_stop_starts_as_the_trial_did_though_the_ship_still_accelerates():
     """At its own propeller speeds, with which it would go faster yet."""
     model = rudder_model(step=STEP)

@@ -111,6 +111,7 @@ def test_a_crash_stop(model, tmp_path, capsys):
         (["zigzag", "--angle", "20/10/5"], "--angle is '20/10/5': write degrees"),
         (["turning", "--command", "n=fast"], "--command is 'n=fast': write one number"),
         (["turning", "--speed", "40"], "does not hold 40 m/s"),
+        (["turning", "--current", "--still-water"], "--current and --still-water exclude one"),
         (["turning", "--draws", "3"], "3 draws are too few"),
         (["turning", "--trial", "none.csv"], "there is no file 'none.csv'"),
         (["turning", "--report", "no/x.html"], "cannot write 'no/x.html'"),
