@@ -155,7 +155,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.files import check_targets
     from greybox.model.model import load_model
     from greybox.prediction.predict import predict_manoeuvre
-    from greybox.report.next_steps import after_prediction, typed
+    from greybox.report.next_steps import after_prediction, fewer_terms, typed
     from greybox.trial.manoeuvres import Compliance
 
     if options.out:
@@ -203,15 +203,15 @@ def run(options: argparse.Namespace) -> None:
     record = provenance(options)
     written = _write_runs(made, options.out) if options.out else []
 
-    vessel = typed(model.record.get("provenance", {}), "vessel", "V")
+    next_to = typed(model.record.get("provenance", {}), "vessel", "V"), fewer_terms(model)
 
     def page() -> Page:
         from greybox.report.prediction import prediction_page
 
-        return prediction_page(made, record, vessel)
+        return prediction_page(made, record, *next_to)
 
     result = made.to_dict() | {"provenance": record}
-    steps = after_prediction(made, record, vessel)
+    steps = after_prediction(made, record, *next_to)
     publish(options, result, made.summary(), page, steps, written)
 
 

@@ -106,7 +106,7 @@ def run(options: argparse.Namespace) -> None:
 
         raise DivergenceError(
             f"the free run left its bound at sample {result.diverged} of {len(result.log)}: "
-            f"this model cannot be simulated on '{log.name}'. Estimate a smaller structure."
+            f"this model cannot be simulated on '{log.name}'. Estimate it with --reduce."
         )
     states = model.structure.states
     columns = {"t": result.log.t} | {s: result.x[:, i] for i, s in enumerate(states)}

@@ -65,8 +65,8 @@ def run_notes(
     diverged = int(runs.diverged[1:].sum())
     if diverged:
         told.append(
-            f"{diverged} of {total} draws diverge and count in no interval: estimate a smaller "
-            f"structure, or on a longer log."
+            f"{diverged} of {total} draws diverge, which is a defect of the model and nothing that "
+            f"the ship does; they count in no interval."
         )
     short = int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum())
     if runs.complete[0] < 0:

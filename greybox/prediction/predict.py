@@ -381,7 +381,8 @@ def _one(
         raise InfeasibleError(
             f"the run of the estimate itself diverges within {runs.t[-1] - runs.t[runs.order]:.3g} "
             f"s of the order of the {kind} manoeuvre at {start.speed[0]:.3g} m/s: this model "
-            f"cannot predict it. Estimate a smaller structure, or on a log with such motion."
+            f"cannot predict it. Let greybox estimate leave terms out (--reduce), or estimate "
+            f"on a log with such motion."
         )
     executes = orders.executes if isinstance(orders, ZigZagOrders) else None
     angular = helm.angular and task.order is not None
@@ -432,7 +433,7 @@ def _one(
         _label(kind, helm, task, asked),
         {n: q for n, q in commands.items() if q is not None},
         values,
-        _criteria(own, values, model.vessel.length, resting),
+        _criteria(own, values, model.vessel.length, resting, tables, int(runs.diverged[1:].sum())),
         asked.draws,
         int(runs.diverged[1:].sum()),
         int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum()),
@@ -503,12 +504,19 @@ def _criteria(
     values: Mapping[str, MonteCarloQuantity | None],
     length: float,
     resting: Sequence[str],
+    tables: Sequence[Mapping[str, Quantity | None]],
+    diverged: int,
 ) -> tuple[Criterion, ...]:
-    """Judge the limits that apply by the intervals of the draws, where logs speak for them."""
+    """Judge the limits that apply by the intervals of the draws, where logs speak for them.
+
+    `tables` hold the quantities of each draw, of which `diverged` are none for what the ship does:
+    they are a defect of the model.
+    """
     made = []
     unsteered = isinstance(own, TurningCircle) and own.rudder is None
     for criterion in own.criteria:
-        value = values.get(CRITERIA.get(criterion.name, ""))
+        name = CRITERIA.get(criterion.name, "")
+        value = values.get(name)
         if criterion.limit is None:
             made.append(replace(criterion, reason="no angle steers") if unsteered else criterion)
             continue
@@ -521,9 +529,15 @@ def _criteria(
         shown = value.scaled(1 / length, "1") if lengths else value
         judged = check_limit(criterion.name, shown, criterion.limit, criterion.reason)
         if judged.verdict is Compliance.PASS and not value.certain:
-            reason = f"{value.reached} of {value.draws} draws reach it"
+            most = criterion.limit * (length if lengths else 1.0)
+            within = sum(q is not None and q.value <= most for q in (t.get(name) for t in tables))
+            all_of = "all" if within == value.reached else f"{within} of the"
+            lost = [f"{diverged} diverge"] * bool(diverged)
+            short = value.draws - value.reached - diverged
+            lost += [f"{short} do not complete it"] * (short > 0)
+            reason = f"{all_of} {value.reached} draws that complete it meet it; {', '.join(lost)}"
             judged = replace(judged, verdict=Compliance.OPEN, reason=reason)
-        if CRITERIA.get(criterion.name) in resting:
+        if name in resting:
             judged = replace(judged, verdict=Compliance.OPEN)
         made.append(judged)
     return tuple(made)

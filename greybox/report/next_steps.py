@@ -253,16 +253,38 @@ def _within_the_logs(made: ManoeuvrePrediction, model: str) -> list[NextStep]:
     ] * bool(told)
 
 
+def fewer_terms(model: ManoeuvringModel) -> str:
+    """Return the command that estimates a model of fewer terms on the same logs."""
+    record = model.record.get("provenance", {})
+    if record.get("command", {}).get("reduce"):
+        return ""
+    validate = typed(record, "validate", "")
+    held = f" --validate {validate}" if validate else ""
+    return (
+        f"greybox estimate {typed(record, 'logs', 'LOG…')} --vessel {typed(record, 'vessel', 'V')}"
+        f"{held} --reduce --out reduced.json"
+    )
+
+
 def after_prediction(
-    made: ManoeuvrePrediction, record: dict[str, Any], vessel: str
+    made: ManoeuvrePrediction, record: dict[str, Any], vessel: str, fewer: str = ""
 ) -> list[NextStep]:
-    """Return what makes the prediction surer, or puts it to the test."""
+    """Return what makes the prediction surer, or puts it to the test.
+
+    `fewer` is the command that estimates fewer terms, for a model whose draws diverge.
+    """
     from greybox.prediction.result import CRITERIA
     from greybox.trial.manoeuvres import Compliance
 
     model = typed(record, "model", "MODEL")
     agreements = [m.agreement for m in made.manoeuvres if m.agreement is not None]
     steps = _within_the_logs(made, model)
+    if fewer and any(m.diverged for m in made.manoeuvres):
+        steps.append(
+            NextStep(
+                "Estimate fewer terms, as some draws of this model diverge, and predict", fewer
+            )
+        )
     if made.instant:
         ship = made.manoeuvres[0].log.vessel
         rates = dict.fromkeys(

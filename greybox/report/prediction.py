@@ -44,7 +44,9 @@ _DOUBTS = {
 }
 
 
-def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any], vessel: str = "V") -> Page:
+def prediction_page(
+    made: ManoeuvrePrediction, record: dict[str, Any], vessel: str = "V", fewer: str = ""
+) -> Page:
     """Return the page: verdicts in the headline, a section with pictures for each manoeuvre."""
     sections = [_section(m, f"prediction{i}") for i, m in enumerate(made.manoeuvres)]
     lead, *others = sections[0].pictures
@@ -59,7 +61,7 @@ def prediction_page(made: ManoeuvrePrediction, record: dict[str, Any], vessel: s
               if made.notes else []),
         ],
         lead=replace(lead, caption=f"{sections[0].title}: {lead.caption}"),
-        next_steps=after_prediction(made, record, vessel),
+        next_steps=after_prediction(made, record, vessel, fewer),
         computed=computed(record),
     )  # fmt: skip
 

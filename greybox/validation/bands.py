@@ -111,7 +111,7 @@ class Bands:
             told.append(
                 f"{self.diverged} of {self.runs} draws of the parameters diverge and were left out"
                 + (
-                    ", too many for a band: estimate a smaller structure, or on a longer log."
+                    ", too many for a band: estimate with --reduce, or on a longer log."
                     if np.isnan(self.motion).any()
                     else "."
                 )

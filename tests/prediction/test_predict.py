@@ -18,7 +18,7 @@ from greybox.model.model import load_model
 from greybox.model.noise import NoiseLevels
 from greybox.prediction.measuring import quantities
 from greybox.prediction.predict import predict_manoeuvre
-from greybox.report.next_steps import after_prediction
+from greybox.report.next_steps import after_prediction, fewer_terms
 from greybox.report.prediction import headline, prediction_page
 from greybox.trial.log import make_log
 from greybox.trial.manoeuvres import Compliance, Criterion, find_manoeuvres
@@ -216,7 +216,7 @@ def test_draws_that_diverge_are_counted():
     model = rudder_model(step=0.25)
     covariance = np.zeros_like(model.covariance)
     i = model.names.index("Nr")
-    covariance[i, i] = (0.7 * model.theta[i]) ** 2
+    covariance[i, i] = (0.45 * model.theta[i]) ** 2
     made = predict_manoeuvre(
         replace(model, covariance=covariance), "turning", side="port", draws=60, command=12.0
     )
@@ -224,8 +224,20 @@ def test_draws_that_diverge_are_counted():
     lost = turn.diverged + turn.incomplete
     assert 0 < lost < 40
     assert turn.quantities["advance"].reached <= 60 - turn.diverged
-    assert f"{turn.diverged} of 60 draws diverge" in made.summary()
-    assert turn.criterion("advance").verdict is not Compliance.PASS
+    assert f"{turn.diverged} of 60 draws diverge, which is a defect of the model" in made.summary()
+    criterion, reached = turn.criterion("advance"), turn.quantities["advance"].reached
+    assert criterion.verdict is not Compliance.PASS
+    told = f"all {reached} draws that complete it meet it; {turn.diverged} diverge"
+    assert criterion.reason == told
+    # the next step names the command of the model's own logs
+    logs = {"command": {"logs": ["a.csv"], "vessel": "v.toml", "validate": ["b.csv"]}}
+    fewer = fewer_terms(replace(model, record={"provenance": logs}))
+    steps = [s.line() for s in after_prediction(made, {}, "v.toml", fewer)]
+    assert any(
+        s.endswith("greybox estimate a.csv --vessel v.toml --validate b.csv --reduce --out "
+                   "reduced.json") for s in steps)  # fmt: skip
+    logs["command"]["reduce"] = True
+    assert fewer_terms(replace(model, record={"provenance": logs})) == ""
 
 
 def test_draws_that_cannot_hold_the_speed_are_counted():
