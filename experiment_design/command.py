@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import re
+import shlex
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +57,17 @@ _LARGEST_ROOM = 1_000_000
 
 
 @dataclass(frozen=True)
+class Planned:
+    """A plan, what its summary tells, notes, what its JSON says beside, and a headline."""
+
+    design: Any
+    found: Any
+    notes: tuple[str, ...]
+    more: dict[str, Any]
+    headline: str = ""
+
+
+@dataclass(frozen=True)
 class Purpose:
     """What a trial may be designed for.
 
@@ -66,7 +79,7 @@ class Purpose:
         What the trial is for; empty where only its own options ask for it.
     run : callable
         Takes the options, the model, the vessel, what has been sailed or None and sentences on it,
-        designs the trial and writes it.
+        and designs the trial.
     asked_by : tuple of str
         Options that ask for it where ``--for`` is not given.
     whole : bool
@@ -75,7 +88,7 @@ class Purpose:
 
     name: str
     words: str
-    run: Callable[[argparse.Namespace, Any, Any, Any, tuple[str, ...]], None]
+    run: Callable[[argparse.Namespace, Any, Any, Any, tuple[str, ...]], Planned]
     asked_by: tuple[str, ...] = ()
     whole: bool = False
 
@@ -399,15 +412,40 @@ def run(options: argparse.Namespace) -> None:
         model = load_model(options.between[0] if options.between else options.model)
     if not (untried or purpose.whole):
         model = model.coefficient_model()
-    purpose.run(options, model, vessel, sailed, told)
+    planned = purpose.run(options, model, vessel, sailed, told)
+    shorter = _shorter(
+        options, planned, lambda halved: purpose.run(halved, model, vessel, sailed, told)
+    )
+    _deliver(options, replace(planned, design=replace(planned.design, shorter=shorter)))
+
+
+def _shorter(
+    options: argparse.Namespace, planned: Planned, again: Callable[[argparse.Namespace], Planned]
+) -> str:
+    """Return the command of half the duration, where that keeps limits that this plan may not."""
+    from greybox.errors import GreyboxError
+
+    design = planned.design
+    if options.target or design.broken or not design.doubtful or design.request.stand_ins:
+        return ""
+    half = _duration(options) / 2
+    times = [n for n in ("duration", "remaining") if getattr(options, n) is not None]
+    halved = argparse.Namespace(**vars(options) | dict.fromkeys(times, half))
+    try:
+        if again(halved).design.remedy:
+            return ""
+    except GreyboxError:
+        return ""
+    typed = " ".join(shlex.quote(t) for t in getattr(options, "typed", ()))
+    for name in times:
+        typed = re.sub(rf"--{name}[ =]\S+", f"--{name} {half:g}", typed)
+    return f"greybox {typed}"
 
 
 def _run_for_coefficients(
     options: argparse.Namespace, model: Any, vessel: Any, sailed: Any, told: tuple[str, ...]
-) -> None:
-    """Design the trial that tells coefficients and write it."""
-    from dataclasses import replace
-
+) -> Planned:
+    """Design the trial that tells coefficients."""
     from experiment_design.design import design_trial
     from experiment_design.duration import least_duration
 
@@ -430,26 +468,22 @@ def _run_for_coefficients(
         progress=progress("design"),
         workers=options.workers,
     )
-    _deliver(options, design, design, notes, _of_sailed(sailed))
+    return Planned(design, design, notes, _of_sailed(sailed))
 
 
-def _deliver(
-    options: argparse.Namespace,
-    design: Any,
-    found: Any,
-    notes: tuple[str, ...],
-    more: dict[str, Any],
-    headline: str = "",
-) -> None:
+def _deliver(options: argparse.Namespace, planned: Planned) -> None:
     """Write the plan and all that was asked for beside it, and tell what was found."""
     from experiment_design.output.next_steps import after_design
     from experiment_design.output.result import write_plan
     from greybox.files import write_json
 
+    design, found, notes, headline = (
+        planned.design, planned.found, planned.notes, planned.headline
+    )  # fmt: skip
     write_plan(design, options.out)
     legs, said = _legs(options, design)
     if options.json:
-        data: dict[str, Any] = found.to_dict() | said | more
+        data: dict[str, Any] = found.to_dict() | said | planned.more
         data["notes"] = [*notes, *data["notes"]]
         write_json(data | {"provenance": provenance(options)}, options.json)
     _show(options, design, notes, legs, headline)
@@ -463,7 +497,8 @@ def _deliver(
     others = (options.sheet, options.report, options.save_model)
     for path in filter(None, (options.out, *_legs_files(options), *others)):
         say(f"wrote {path}")
-    show_next(after_design(provenance(options), bool(headline), design.remedy, design.missed()))
+    record = provenance(options)
+    show_next(after_design(record, bool(headline), design.remedy, design.missed(), design.shorter))
 
 
 def _duration(options: argparse.Namespace) -> float:
@@ -493,8 +528,6 @@ def _duration(options: argparse.Namespace) -> float:
 
 def _after(options: argparse.Namespace, vessel: Any) -> tuple[Any, Any, tuple[str, ...]]:
     """Return the model of what has been sailed, that itself, and sentences on both."""
-    from dataclasses import replace
-
     from experiment_design.after import sailed_trial
     from greybox.commands.common import read_logs
     from greybox.model.catalogue import get_structure
@@ -541,8 +574,6 @@ def _prepared(
     options: argparse.Namespace, model: Any, asked: Any, vessel: Any, sailed: Any
 ) -> tuple[Any, bool]:
     """Return the prepared request, and whether its first trial starts where the logs ended."""
-    from dataclasses import replace
-
     from experiment_design.after import lacking_margin
     from experiment_design.prepare import prepare_request
     from experiment_design.request.regimes import state_words
@@ -570,8 +601,8 @@ def _prepared(
 
 def _run_for_prediction(
     options: argparse.Namespace, model: Any, vessel: Any, sailed: Any, told: tuple[str, ...]
-) -> None:
-    """Design the trial that serves predictions and write it."""
+) -> Planned:
+    """Design the trial that serves predictions."""
     from experiment_design.for_prediction import design_for_prediction, planning_model
     from experiment_design.prepare import both_sides
 
@@ -592,13 +623,13 @@ def _run_for_prediction(
         workers=options.workers,
         sailed=sailed.motions if sailed is not None else (),
     )
-    _deliver(options, found.design, found, notes, _of_sailed(sailed), found.headline())
+    return Planned(found.design, found, notes, _of_sailed(sailed), found.headline())
 
 
 def _run_for_causes(
     options: argparse.Namespace, model: Any, vessel: Any, sailed: Any, told: tuple[str, ...]
-) -> None:
-    """Design the trial that tells causes apart and write it."""
+) -> Planned:
+    """Design the trial that tells causes apart."""
     from experiment_design.for_causes import (
         AskedCauses,
         causes_left_open,
@@ -635,7 +666,7 @@ def _run_for_causes(
         workers=options.workers,
     )
     notes = (*held, *request.of_both_sides)
-    _deliver(options, found.design, found, notes, {}, found.headline())
+    return Planned(found.design, found, notes, {}, found.headline())
 
 
 def _range(text: str, vessel: Any) -> tuple[str, tuple[float, float]]:
@@ -663,8 +694,8 @@ def _range(text: str, vessel: Any) -> tuple[str, tuple[float, float]]:
 
 def _run_between(
     options: argparse.Namespace, model: Any, vessel: Any, sailed: Any, told: tuple[str, ...]
-) -> None:
-    """Design the trial between two models and write it."""
+) -> Planned:
+    """Design the trial between two models."""
     from experiment_design.discriminate import design_between
     from experiment_design.prepare import expected_disturbances, require_own_commands
     from experiment_design.request.request import CandidateModel, full_structure
@@ -708,7 +739,7 @@ def _run_between(
         workers=options.workers,
     )
     lines = found.summary().splitlines()
-    _deliver(options, found.design, found, notes, {}, f"{lines[0]}: {lines[3]}.")
+    return Planned(found.design, found, notes, {}, f"{lines[0]}: {lines[3]}.")
 
 
 def _legs_files(options: argparse.Namespace) -> tuple[Path, ...]:

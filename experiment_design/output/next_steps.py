@@ -9,7 +9,11 @@ from greybox.report.next_steps import NextStep, typed
 
 
 def after_design(
-    record: Mapping[str, Any], judged: bool, remedy: str = "", missed: Sequence[str] = ()
+    record: Mapping[str, Any],
+    judged: bool,
+    remedy: str = "",
+    missed: Sequence[str] = (),
+    shorter: str = "",
 ) -> list[NextStep]:
     """Return what to do once the plan has been sailed, or before one that breaks its limits is.
 
@@ -23,9 +27,14 @@ def after_design(
         What helps a plan that does not keep its limits as it was asked to.
     missed : sequence of str
         Which limits it does not keep.
+    shorter : str
+        Command of a shorter plan that was tried and keeps them.
     """
     if remedy:
         why = f" ({'; '.join(missed)})" if missed else ""
+        if shorter:
+            tried = "half the duration keeps its limits, as was tried"
+            return [NextStep(f"Do not sail this plan as it is{why}: {tried}", shorter)]
         return [NextStep(f"Do not sail this plan as it is{why}: {remedy}")]
     vessel, given = typed(record, "vessel", "V"), record.get("command", {})
     check = NextStep(

@@ -74,7 +74,9 @@ def design_page(
         headline=headline or (UNTRIED if r.untried else "") + saving(design),
         sentences=[_sentence(s) for s in said],
         lead=parts[0].pictures[0],
-        next_steps=after_design(record, bool(headline), design.remedy, design.missed()),
+        next_steps=after_design(
+            record, bool(headline), design.remedy, design.missed(), design.shorter
+        ),
         pictures=[*(shown[0].pictures if one else []), *_std_pictures(design, reference)],
         tables=[
             *([_std_table(design, reference)] if np.isfinite(design.std).all() else []),

@@ -111,6 +111,8 @@ class Design(DisplayMixin):
         In order, lead-in included; empty where each trial is one part.
     random_std : ndarray or None
         (p_w,) predicted standard errors of the best random two-level sequences.
+    shorter : str
+        Command of a shorter plan that was tried and keeps limits that this one may not.
     """
 
     request: PreparedRequest
@@ -135,6 +137,7 @@ class Design(DisplayMixin):
     seconds: float
     parts: tuple[PlanPart, ...] = ()
     random_std: Array | None = None
+    shorter: str = ""
 
     @property
     def lead_in_s(self) -> float:

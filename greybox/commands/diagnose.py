@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from greybox.report.page import Page
     from greybox.selection.stretches import Drawn
     from greybox.trial.log import TrialLog
+    from greybox.vessel.vessel import Vessel
 
 HELP = "show what the simulation gets wrong, name the cause, extend the model"
 EXAMPLES = """examples:
@@ -160,7 +161,8 @@ def run(options: argparse.Namespace) -> None:
         ),
     )
     record = provenance(options) | {"logs": _read(logs), "validate": _read(validate)}
-    steps = _with_files(diagnosis.next_steps, record)
+    steps = [*_where_antenna(diagnosis, vessel), *_with_files(diagnosis.next_steps, record)]
+    steps += _with_model(diagnosis, record)
     diagnosis = replace(
         diagnosis, next_steps=tuple(steps), notes=(*left_out, *also, *diagnosis.notes)
     )
@@ -197,6 +199,36 @@ def _with_files(steps: Sequence[str], record: Mapping[str, Any]) -> list[str]:
             0, f"write the models to files: the same command with: --out {quote(str(model))}"
         )
     return filled
+
+
+def _where_antenna(diagnosis: Diagnosis, vessel: Vessel) -> list[str]:
+    """Return what tells an antenna from what looks like one, where nothing says where it stands."""
+    found = [c.id for c in (*diagnosis.causes, *diagnosis.candidates) if "antenna" in c.evidence]
+    if not found or "antenna" in vessel.sensors:
+        return []
+    return [
+        "measure where the antenna of the positions stands, as these logs tell it badly from "
+        "coupled inertia: state antenna = [x, y] in [sensors] of the vessel file, and repeat"
+    ]
+
+
+def _with_model(diagnosis: Diagnosis, record: Mapping[str, Any]) -> list[str]:
+    """Return what to do with the extended model where it was written."""
+    from shlex import quote
+
+    from greybox.report.next_steps import typed
+
+    out = record["command"].get("out")
+    if not out or not diagnosis.causes:
+        return []
+    held, other = typed(record, "validate", "LOG"), typed(record, "model", "model.json")
+    whose = "that diagnosed" if record["command"].get("model") else "that of greybox estimate"
+    return [
+        f"of two models, {whose} and the extended one, predict with the one that follows better "
+        f"what neither was estimated on: greybox compare {other} {quote(out)} --log {held}",
+        f"predict manoeuvres with the extended model: greybox predict {quote(out)} zigzag "
+        f"--report zigzag.html",
+    ]
 
 
 def _drawn_from(drawn: Drawn) -> str:

@@ -168,7 +168,9 @@ class DiagnosisBuilder:
         changed = found.final is not found.base
         after = self.model(found.final, self.record(found.causes)) if changed else before
         gain, runs, after = self.gain(before, after, validate, found.final)
-        ruling = rule(found, case.held_out, groups, known, gain, lines[1])
+        speed = max(float(np.max(log["u"])) for log in case.logs)
+        seconds = case.logs[0].vessel.trial_seconds(speed)
+        ruling = rule(found, case.held_out, groups, known, gain, lines[1], seconds)
         final = self.final = ruling.final
         if final is not found.final:
             gain, runs, after = self.gain(before, before, validate, final)

@@ -221,6 +221,14 @@ def _long_enough(logs: Sequence[TrialLog]) -> list[TrialLog]:
     return kept
 
 
+# words of the field for what causes are called by
+_ALSO = {
+    "antenna": "lever_arm", "gps": "lever_arm", "set": "current", "tide": "current",
+    "compass": "heading_bias", "gyro": "heading_bias", "lag": "thruster_lag",
+    "delay": "input_delay", "rudder_offset": "angle_offset", "clock": "clock_offset",
+}  # fmt: skip
+
+
 def _chosen(ids: Sequence[str] | None) -> dict[str, Cause]:
     known = known_causes()
     for name in ids or ():
@@ -228,7 +236,7 @@ def _chosen(ids: Sequence[str] | None) -> dict[str, Cause]:
             raise UsageError(
                 f"there is no cause '{name}'"
                 f"{': write causes apart, with spaces' if ',' in name else ''}."
-                f"{suggestion(name, known)} Known: {', '.join(known)}."
+                f"{suggestion(_ALSO.get(name.casefold(), name), known)} Known: {', '.join(known)}."
             )
     return {k: c for k, c in known.items() if ids is None or k in ids}
 

@@ -42,8 +42,8 @@ _SAID = {
 
 # share of the squared error from which on a part is worth a line of text
 _SHOWN = 0.005
-# a 95 % interval of a share that is wider excludes none, from minus to plus the whole error
-_ANY = 2.0
+# a 95 % interval of a share that is wider than the whole error tells nothing of it
+_ANY = 1.0
 
 
 def finite(value: float) -> float | None:
@@ -411,7 +411,9 @@ class Diagnosis(DisplayMixin):
             if causes:
                 lines += ["", f"{title}:"]
             for c in causes:
-                lines.append(f"  {c.id}: {c.evidence}")
+                # the verdict tells the evidence of those that stand
+                said = c.title if c.evidence in self.headline else c.evidence
+                lines.append(f"  {c.id}: {said}")
                 lines += [
                     f"    {name:<22}{with_error(q.value, q.std):>24} {q.unit}".removesuffix(" 1")
                     for name, q in c.parameters.items()
@@ -429,7 +431,8 @@ class Diagnosis(DisplayMixin):
             )
             lines.append(f"Against the terms that the data chose: {', '.join(told)}.")
         lines += _budget_lines(self.budget)
-        lines += ["", self.remaining]
+        if self.remaining not in self.headline:
+            lines += ["", self.remaining]
         if self.remainder is not None:
             lines.append(self.remainder.reason)
             if self.remainder.gain:
@@ -537,7 +540,7 @@ def is_split(part: BudgetPart, state: str) -> bool:
 def told_share(part: BudgetPart, state: str) -> str:
     """Return a share with its interval in percent, or that the logs do not tell it."""
     if not is_split(part, state):
-        return "cannot be split"
+        return "not determined"
     low, high = part.ci[state]
     return f"{100 * part.share[state]:.1f} ({100 * low:.1f} to {100 * high:.1f})"
 

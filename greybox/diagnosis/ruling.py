@@ -75,6 +75,7 @@ def rule(
     known: Sequence[Found],
     gain: Mapping[str, Gain],
     waves: Waves | None = None,
+    seconds: float = 900.0,
 ) -> Ruling:
     """Decide the verdict.
 
@@ -91,6 +92,8 @@ def rule(
         Fit of the held-out free run without causes and with them.
     waves : Waves, optional
         That the logs were sailed in: what they move is nothing that the model should do.
+    seconds : float
+        How long a trial to plan next may last [s].
     """
     final, stand, leaning, notes = found.final, found.causes, found.leaning, []
     # a run that is worse than a constant predicts nothing, however much worse it is
@@ -134,7 +137,7 @@ def rule(
     kept = float(np.exp(worse(held_out, final, found.before))) if stand else 1.0
     return Ruling(
         verdict, named, leaning, _remaining(final, pairs, left, why, kept, waves),
-        _next(verdict, groups, bool(anew)), first, left, final, tuple(notes),
+        _next(verdict, groups, bool(anew), seconds), first, left, final, tuple(notes),
     )  # fmt: skip
 
 
@@ -319,7 +322,10 @@ def _remaining(final: Fit, pairs: Sequence[Pair], left: Omnibus, why: str, kept:
 
 
 def _next(
-    verdict: DiagnosisVerdict, groups: Sequence[Sequence[Candidate]], anew: bool
+    verdict: DiagnosisVerdict,
+    groups: Sequence[Sequence[Candidate]],
+    anew: bool,
+    seconds: float = 900.0,
 ) -> list[str]:
     out = []
     for ids in ([c.hypothesis.id for c in pair] for pair in groups):
@@ -328,7 +334,7 @@ def _next(
             told = f"--between {' '.join(f'MODEL.{file_word(i)}.json' for i in ids)}"
         out.append(
             f"design a trial that tells {' from '.join(ids)}: greybox design --vessel V {told} "
-            f"--duration 900 --out plan.csv"
+            f"--duration {seconds:g} --out plan.csv"
         )
     if anew:
         out.append(
@@ -343,8 +349,8 @@ def _next(
     if verdict in (DiagnosisVerdict.NAMED, DiagnosisVerdict.PARTLY):
         out.append(
             "design the next trial with the extended model, so that its least certain "
-            "coefficients move: greybox design --vessel V --model MODEL --duration 900 "
-            "--out plan.csv"
+            f"coefficients move: greybox design --vessel V --model MODEL --duration {seconds:g} "
+            f"--out plan.csv"
         )
     if verdict is DiagnosisVerdict.NONE:
         out.append("the model may be used as it is; a trial in other conditions would tell more")

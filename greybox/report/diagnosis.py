@@ -207,7 +207,7 @@ def _budget(diagnosis: Diagnosis) -> Iterator[Picture]:
             "extended; the part of a cause is how much smaller the error would be without it."
         )
         if not all(is_split(p, state) for p in budget for state in p.share):
-            caption += " Shares that the logs cannot split are not drawn."
+            caption += " Shares that the logs do not determine are not drawn."
         if cut_off(budget):
             caption += " Shares beyond the picture's edge stand in the table of the budget."
         caption += f" {told}" if (told := hardly_split(budget)) else ""

@@ -96,7 +96,7 @@ def largest(budget: Sequence[BudgetPart]) -> str:
         name = LABELS.get(state, state).split(" [")[0]
         parts = [p for p in budget if is_split(p, state)]
         if not parts:
-            told.append(f"{name}: cannot be split")
+            told.append(f"{name}: not determined")
             continue
         part = max(parts, key=lambda p: p.share[state])
         told.append(f"{name}: {part.part} {100 * part.share[state]:.0f} %")

@@ -299,6 +299,8 @@ def after_prediction(
                 f"that model: orders of {', '.join(made.instant)} act at once in this one"
             )
         )
+    speeds = [q.value for m in made.manoeuvres if (q := m.quantities["approach_speed"])]
+    seconds = made.manoeuvres[0].log.vessel.trial_seconds(max(speeds, default=0.0))
     if any(
         c.verdict is Compliance.OPEN and CRITERIA.get(c.name) not in m.resting
         for m in made.manoeuvres
@@ -307,7 +309,8 @@ def after_prediction(
         steps.append(
             NextStep(
                 "Plan a trial that narrows these intervals",
-                f"greybox design --vessel {vessel} --model {model} --duration 900 --out plan.csv",
+                f"greybox design --vessel {vessel} --model {model} --duration {seconds:g} "
+                f"--out plan.csv",
             )
         )
     if made.prediction in _DOUBTED or not all(r.agrees for a in agreements for r in a.rows):

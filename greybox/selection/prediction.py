@@ -173,6 +173,11 @@ def require_others(logs: Sequence[TrialLog], validate: Sequence[TrialLog]) -> No
             same = own.provenance.sha256 == log.provenance.sha256 != ""
             if same and own.t[0] <= log.t[-1] and log.t[0] <= own.t[-1]:
                 raise part_of_estimate(log)
+            if _alike(log, own):
+                raise UsageError(
+                    f"'{log.name}' holds the same samples as '{own.name}', and a log that the "
+                    f"estimate used cannot judge it: name another to validate."
+                )
 
 
 def part_of_estimate(log: TrialLog) -> UsageError:
@@ -180,6 +185,15 @@ def part_of_estimate(log: TrialLog) -> UsageError:
     return UsageError(
         f"'{log.name}' is given both to estimate on and to validate: a log that the estimate used "
         f"cannot judge it. Name it once."
+    )
+
+
+def _alike(log: TrialLog, other: TrialLog) -> bool:
+    """Whether two logs hold the same samples."""
+    return (
+        np.array_equal(log.t, other.t)
+        and log.channels.keys() == other.channels.keys()
+        and all(np.array_equal(log[c], other[c]) for c in log.channels)
     )
 
 
@@ -193,8 +207,7 @@ def require_distinct(logs: Sequence[TrialLog]) -> None:
     """
     for i, log in enumerate(logs):
         for other in logs[:i]:
-            alike = np.array_equal(log.t, other.t) and log.channels.keys() == other.channels.keys()
-            if alike and all(np.array_equal(log[c], other[c]) for c in log.channels):
+            if _alike(log, other):
                 raise UsageError(
                     f"'{other.name}' and '{log.name}' hold the same {len(log)} samples, which "
                     f"would count as two trials: name each trial once."

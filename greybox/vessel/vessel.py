@@ -432,6 +432,14 @@ class Vessel(DisplayMixin):
                 found.setdefault(column, []).append(limits)
         return {name: _tightest(limits) for name, limits in found.items()}
 
+    def trial_seconds(self, speed: float) -> float:
+        """Return how long a trial to plan next may last at a speed [m/s]: 30 ship lengths [s].
+
+        In a longer one the motions of models drawn from a prior spread so far that its limits are
+        hardly kept.
+        """
+        return min(max(round(30 * self.length / max(speed, 1e-9) / 50), 2) * 50.0, 900.0)
+
     @property
     def force_unit(self) -> str:
         """Unit of the generalised force: N, or that of the propeller speed; else ``mixed``."""

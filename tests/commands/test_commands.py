@@ -8,6 +8,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +18,7 @@ from browser import without_scripts
 from schemas import schema
 from virtual import recorded, virtual_log, write_csv
 
-from greybox.commands.diagnose import _with_files
+from greybox.commands.diagnose import _where_antenna, _with_files, _with_model
 from greybox.commands.main import main
 from greybox.diagnosis.result import DiagnosisVerdict
 from greybox.diagnosis.ruling import _next
@@ -142,6 +143,10 @@ def test_a_plan_of_commands_is_simulated_from_a_start(noisy_csv, tmp_path, capsy
         (["compare", "{log}", "--log", "{log}"], "is not a model file"),
         (["compare", "m", "--log", "{log}", "--report", "x.pdf"], "a page is HTML: name a file"),
         (["diagnose", "{log}", "--vessel", "thesis", "--validate", "{log}"], "Name it once"),
+        (
+            ["diagnose", "{log}", "--vessel", "thesis", "--validate", "{log},{log}"],
+            "separate the files with spaces",
+        ),
         (["diagnose", "{log}", "{log}", "--vessel", "thesis"], "name each trial once"),
         (["reproduce", "chapter4", "--runs", "1"], "needs at least 2 runs"),
         (["reproduce", "chapter4", "--estimate", "x"], "belong to chapter7"),
@@ -402,6 +407,22 @@ def test_next_steps_name_the_files_of_the_user():
         "greybox diagnose 'day 2.csv' --vessel 'my ship.toml' --model mine.json "
         "--report diagnosis.html"
     )
+
+
+def test_after_a_diagnosis_both_models_are_compared_and_the_antenna_is_asked_for():
+    found = SimpleNamespace(
+        id="inertia_coupling", evidence="or an antenna ahead, which looks alike"
+    )
+    diagnosis = SimpleNamespace(causes=(found,), candidates=())
+    record = {"command": {"out": "mended.json", "validate": ["t3.csv"]}}
+    compared, predicted = _with_model(diagnosis, record)
+    assert compared.endswith(": greybox compare model.json mended.json --log t3.csv")
+    assert predicted.endswith(": greybox predict mended.json zigzag --report zigzag.html")
+    assert _with_model(diagnosis, {"command": {}}) == []
+    vessel = load_vessel("thesis")
+    (asked,) = _where_antenna(diagnosis, replace(vessel, sensors={}))
+    assert asked.endswith("state antenna = [x, y] in [sensors] of the vessel file, and repeat")
+    assert _where_antenna(diagnosis, replace(vessel, sensors={"antenna": (1.0, 0.0)})) == []
 
 
 def test_what_is_told_to_do_next_can_be_typed_as_it_stands(tmp_path, capsys, monkeypatch):

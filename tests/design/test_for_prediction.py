@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from argparse import Namespace
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from designs import limited_ship, make_request, ship_file, thesis_model
 
 from experiment_design import for_prediction
+from experiment_design.command import Planned, _shorter
 from experiment_design.constraints.limits import Circle, TrialLimits
 from experiment_design.design import CLOSEST
 from experiment_design.excitation.rollout import Rollout
@@ -407,6 +409,23 @@ def test_a_diagnosed_prior_errs_by_what_its_held_out_runs_missed(found, model, m
     (step,) = after_design({}, True, plan.design.remedy)
     assert step.line().startswith("next: do not sail this plan as it is: shorten it (--duration)")
     assert found.design.remedy == ""
+    # half the duration is tried, and its command told where it keeps the limits
+    options = Namespace(
+        target=None, duration=900.0, remaining=None,
+        typed=["design", "--vessel", "my ship.toml", "--duration=900", "--out", "plan.csv"],
+    )  # fmt: skip
+    planned, tried = Planned(plan.design, plan, (), {}), []
+
+    def again(design):
+        return lambda halved: tried.append(halved.duration) or replace(planned, design=design)
+
+    command = "greybox design --vessel 'my ship.toml' --duration 450 --out plan.csv"
+    assert _shorter(options, planned, again(found.design)) == command
+    assert _shorter(options, planned, again(plan.design)) == ""
+    assert _shorter(options, replace(planned, design=found.design), again(found.design)) == ""
+    assert tried == [450.0, 450.0]
+    (step,) = after_design({}, True, plan.design.remedy, (), command)
+    assert step.line().endswith(f"half the duration keeps its limits, as was tried: {command}")
 
 
 def test_an_envelope_ends_at_the_limits_of_the_commands() -> None:

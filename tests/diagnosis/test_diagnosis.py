@@ -15,9 +15,11 @@ from greybox.commands.main import main
 from greybox.diagnosis.builder import diverging
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.gain import block_sums, blocks, gains, run_on
+from greybox.diagnosis.preparing import _chosen
 from greybox.errors import LogError, UsageError
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel, load_model
+from greybox.selection.prediction import require_others
 from greybox.study.blind import Trial, draw, write
 from greybox.study.chapter6 import TRUE
 
@@ -104,6 +106,23 @@ def test_only_the_causes_that_are_asked_for() -> None:
     assert found.tried == 1
     with pytest.raises(UsageError, match=r"no cause 'curent'\. Did you mean 'current'"):
         diagnose([trial.estimation], options=DiagnosisOptions(causes=["curent"]))
+
+
+def test_words_of_the_field_are_answered_with_the_id() -> None:
+    for said, meant in (
+        ("antenna", "lever_arm"),
+        ("curent", "current"),
+        ("compass", "heading_bias"),
+    ):
+        with pytest.raises(UsageError, match=rf"no cause '{said}'\. Did you mean '{meant}'"):
+            _chosen([said])
+
+
+def test_a_copy_of_a_log_cannot_validate() -> None:
+    log = _draw(4, kind="pulses", samples=200).estimation
+    copy = replace(log, name="copy", provenance=replace(log.provenance, sha256="other"))
+    with pytest.raises(UsageError, match="'copy' holds the same samples as"):
+        require_others([log], [copy])
 
 
 def test_short_logs_are_refused_with_both_numbers() -> None:

@@ -298,26 +298,29 @@ def test_parts_that_do_not_add_up_are_said_to():
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_share_that_may_be_any_is_not_told():
-    wide = {"u": (0.15, 0.25), "v": (-0.9, 1.0), "r": (-1.6, 1.8)}
+    wide = {"u": (0.15, 0.25), "v": (-0.2, 0.8), "r": (-0.3, 1.4)}
     budget = (BUDGET[0], replace(BUDGET[1], ci=wide), BUDGET[2])
     named = replace(diagnosis_of("named"), budget=budget)
     (line,) = (x for x in named.summary().splitlines() if x.startswith("  current  "))
-    assert line.split("  ")[-1].strip() == "cannot be split"
-    assert "70.0 (-90.0 to 100.0)" in line
-    assert budget_table(budget).rows[1][-1] == "cannot be split"
+    assert line.split("  ")[-1].strip() == "not determined"
+    assert "70.0 (-20.0 to 80.0)" in line
+    assert budget_table(budget).rows[1][-1] == "not determined"
     widths = [[b.get_width() for b in ax.patches] for ax in budget_figure(budget).axes]
     assert np.isnan(widths[2][1])
     assert np.isfinite(widths[1]).all()
-    unsaid = "Shares that the logs cannot split are not drawn."
+    unsaid = "Shares that the logs do not determine are not drawn."
     page = diagnosis_page(named, RECORD)
     # the picture of what logs do not tell is not the first
     assert unsaid not in page.lead.caption
     assert unsaid in page.sections[0].pictures[-1].caption
     assert unsaid not in diagnosis_page(diagnosis_of("named"), RECORD).lead.caption
-    assert named.to_dict()["budget"][1]["ci"]["r"] == [-1.6, 1.8]
+    assert named.to_dict()["budget"][1]["ci"]["r"] == [-0.3, 1.4]
     assert "current" in largest(BUDGET).split("; ")[-1]
     assert "current" not in largest(budget).split("; ")[-1]
-    assert largest([replace(budget[1], ci=dict.fromkeys("uvr", (-1.6, 1.8)))]).count("split") == 3
+    assert (
+        largest([replace(budget[1], ci=dict.fromkeys("uvr", (-1.6, 1.8)))]).count("not determined")
+        == 3
+    )
 
 
 def test_confused(told):

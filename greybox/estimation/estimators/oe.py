@@ -33,9 +33,13 @@ def _fit(problem: EstimationProblem) -> Fitted:
     if problem.covariance is not None:
         options = replace(options, covariance=problem.covariance, seed=problem.seed)
     start = problem.nominal_theta if problem.start is None else problem.start
-    notes = ["the fit started from a model that was given, or found by an earlier step."]
-    if problem.nominal_theta is not None:
+    notes: list[str] = []
+    if problem.nominal is not None and problem.nominal_theta is not None:
         start = problem.nominal_theta
+        # what an earlier step found has no record
+        given = "from the model that was given (--nominal)"
+        found = "from where the selection of terms ended"
+        notes = [f"the fit started {given if problem.nominal.record else found}."]
     elif problem.start is not None:
         notes = [f"the fit started from the estimate by {problem.start.method}."]
     else:

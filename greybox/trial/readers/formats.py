@@ -140,6 +140,8 @@ def _kind(path: Path) -> str:
         reason = getattr(error, "strerror", None) or error
         raise LogError(f"cannot read '{str(path)[:80]}': {reason}. Name an existing log.") from None
     if not there:
+        if all(Path(part).is_file() for part in str(path).split(",")):
+            raise LogError(f"there is no file '{path}': separate the files with spaces.")
         raise LogError(f"there is no file '{path}'.{nearest_file(path)} Name an existing log.")
     if path.is_dir():
         if is_bag(path):
