@@ -52,6 +52,8 @@ EXAMPLES = """examples:
 """
 
 
+# times the greatest speed of the prior's logs from which on a highest speed limits nothing
+_IDLE = 1.3
 # bytes of a polygon of 500 corners, many times over
 _LARGEST_ROOM = 1_000_000
 
@@ -416,7 +418,25 @@ def run(options: argparse.Namespace) -> None:
     shorter = _shorter(
         options, planned, lambda halved: purpose.run(halved, model, vessel, sailed, told)
     )
-    _deliver(options, replace(planned, design=replace(planned.design, shorter=shorter)))
+    planned = replace(
+        planned,
+        design=replace(planned.design, shorter=shorter),
+        notes=(*_idle_cap(options.speed_cap, model), *planned.notes),
+    )
+    _deliver(options, planned)
+
+
+def _idle_cap(cap: float | None, model: Any) -> list[str]:
+    """Return that a highest speed limits nothing, as no log of the prior comes near it."""
+    from greybox.units import UNITS
+
+    low, high = model.record.get("ranges", {}).get("u", (0.0, 0.0))
+    fastest = max(abs(low), abs(high)) or model.vessel.service_speed
+    if cap is None or not fastest or cap < _IDLE * fastest:
+        return []
+    knots = UNITS["kn"].factor * cap
+    meant = f"; {cap:g} kn is {knots:.3g} m/s" if knots < _IDLE * fastest else ""
+    return [f"--speed-cap {cap:g} m/s limits nothing, as the ship goes {fastest:.3g} m/s{meant}"]
 
 
 def _shorter(

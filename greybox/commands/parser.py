@@ -28,6 +28,11 @@ _SENTENCES = {
 }  # fmt: skip
 
 
+# words of the field for an option
+_ALSO = {"--rudder": "--angle", "--helm": "--angle"}
+_SECONDS = {"s": 1.0, "sec": 1.0, "min": 60.0, "h": 3600.0}
+
+
 class Formatter(RawDescriptionRichHelpFormatter):
     """Coloured help with examples kept as written, and names beside their explanation."""
 
@@ -126,6 +131,8 @@ class Parser(argparse.ArgumentParser):
 
     def _in_its_place(self, option: str) -> str:
         """Return how what an unknown option names is given."""
+        if (meant := _ALSO.get(option, "")) in self._option_string_actions:
+            return f". Did you mean '{meant}'?"
         name = option.lstrip("-").rstrip("s")
         bare = {a.dest.rstrip("s") for a in self._actions if not a.option_strings}
         if name in bare and self.usage:
@@ -151,6 +158,8 @@ class Parser(argparse.ArgumentParser):
             message = "; ".join(self._wanting(n, "is missing") for n in found[1].split(", "))
         if found := re.match(r"argument (\S+): expected (\d+) arguments$", message):
             message = self._wanting(found[1], f"needs {found[2]} values")
+        if found := re.search(rf"'([0-9.]+) ?({'|'.join(_SECONDS)})' is no .*number$", message):
+            message += f", write seconds: {float(found[1]) * _SECONDS[found[2]]:g}"
         message += "." * (not message.endswith((".", "?")))
         if self.place:
             raise ConfigurationError(f"{self.place}: {re.sub('^argument [^:]*: ', '', message)}")

@@ -199,6 +199,8 @@ def run(options: argparse.Namespace) -> None:
             f"the limits of IMO MSC.137(76) are for ships of {_LEAST_LENGTH:g} m and more, and "
             f"this one is {length:g} m long: for the model of a longer ship give --scale.",
         )
+    if any(q is None for m in made.manoeuvres for q in m.quantities.values()):
+        told = (*told, *_radians(options.angle))
     made = replace(made, notes=(*told, *made.notes))
     record = provenance(options)
     written = _write_runs(made, options.out) if options.out else []
@@ -213,6 +215,18 @@ def run(options: argparse.Namespace) -> None:
     result = made.to_dict() | {"provenance": record}
     steps = after_prediction(made, record, *next_to)
     publish(options, result, made.summary(), page, steps, written)
+
+
+def _radians(texts: list[str]) -> list[str]:
+    """Return what angles would be that may have been meant as radians."""
+    import math
+
+    small = [text for text in texts if "/" not in text and float(text) < math.pi / 2]
+    return [
+        f"--angle {text} is in degrees, and the ship hardly turns; {text} rad is "
+        f"{math.degrees(float(text)):.1f} deg."
+        for text in small
+    ]
 
 
 def _current(options: argparse.Namespace) -> bool | None:

@@ -12,6 +12,7 @@ from greybox.errors import InfeasibleError, UsageError
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.helm import Helm, bounds
 from greybox.prediction.ship import ShipDraws
+from greybox.units import UNITS
 
 Array = NDArray[np.float64]
 
@@ -223,9 +224,11 @@ def _first(
     if needed is None:
         ends = [steady(float(g)) or 0.0 for g in (grid[0], grid[-1])]
         values = [_named(helm, helm.drive * g) for g in (grid[0], grid[-1])]
+        knots = UNITS["kn"].factor * speed
+        meant = f"{speed:g} kn is {knots:.3g} m/s. " if ends[0] <= knots <= ends[1] else ""
         raise InfeasibleError(
             f"the model does not hold {speed:g} m/s: from {values[0]} to {values[1]} it reaches "
-            f"{ends[0]:.3g} to {ends[1]:.3g} m/s. Give --speed between these, or --command."
+            f"{ends[0]:.3g} to {ends[1]:.3g} m/s. {meant}Give --speed between these, or --command."
         )
     return needed
 

@@ -11,7 +11,7 @@ import pytest
 from designs import limited_ship, make_request, ship_file, thesis_model
 
 from experiment_design import for_prediction
-from experiment_design.command import Planned, _shorter
+from experiment_design.command import Planned, _idle_cap, _shorter
 from experiment_design.constraints.limits import Circle, TrialLimits
 from experiment_design.design import CLOSEST
 from experiment_design.excitation.rollout import Rollout
@@ -426,6 +426,13 @@ def test_a_diagnosed_prior_errs_by_what_its_held_out_runs_missed(found, model, m
     assert tried == [450.0, 450.0]
     (step,) = after_design({}, True, plan.design.remedy, (), command)
     assert step.line().endswith(f"half the duration keeps its limits, as was tried: {command}")
+
+
+def test_a_highest_speed_that_limits_nothing_is_told() -> None:
+    model = replace(thesis_model(), record={"ranges": {"u": (2.6, 7.6)}})
+    (told,) = _idle_cap(14.0, model)
+    assert told == ("--speed-cap 14 m/s limits nothing, as the ship goes 7.6 m/s; 14 kn is 7.2 m/s")
+    assert _idle_cap(8.0, model) == _idle_cap(None, model) == []
 
 
 def test_an_envelope_ends_at_the_limits_of_the_commands() -> None:

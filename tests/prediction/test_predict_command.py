@@ -111,6 +111,7 @@ def test_a_crash_stop(model, tmp_path, capsys):
         (["zigzag", "--angle", "20/10/5"], "--angle is '20/10/5': write degrees"),
         (["turning", "--command", "n=fast"], "--command is 'n=fast': write one number"),
         (["turning", "--speed", "40"], "does not hold 40 m/s"),
+        (["turning", "--speed", "4"], "4 kn is 2.06 m/s. Give --speed between these"),
         (["turning", "--current", "--still-water"], "--current and --still-water exclude one"),
         (["turning", "--draws", "3"], "3 draws are too few"),
         (["turning", "--trial", "none.csv"], "there is no file 'none.csv'"),
@@ -123,6 +124,26 @@ def test_input_at_fault_is_one_sentence(model, capsys, arguments, message):
     assert error.startswith("greybox predict: ")
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_an_angle_in_radians_is_asked_about(model, capsys):
+    assert run("predict", model, "turning", "--angle", "0.01", "--draws", "40") == 0
+    said = "--angle 0.01 is in degrees, and the ship hardly turns; 0.01 rad is 0.6 deg."
+    assert said in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("predict m.json turning --rudder 35", "Did you mean '--angle'?"),
+        ("design --vessel v --out p --duration 15min", "no positive number, write seconds: 900."),
+        ("design --vessel v --out p --duration 0.5h", "no positive number, write seconds: 1800."),
+    ],
+)
+def test_what_is_meant_is_told_in_the_options_own_words(line, message, capsys):
+    with pytest.raises(SystemExit):
+        main(line.split())
+    assert message in capsys.readouterr().err
 
 
 def test_estimates_keep_the_ranges_of_their_logs(noisy_csv, tmp_path):
