@@ -199,8 +199,8 @@ def test_sea_rooms_that_are_none(folder, capsys, text, message):
 @pytest.mark.usefixtures("hasty")
 def test_between(folder, capsys):
     pair = [str(folder / "model.json"), str(folder / "other.json")]
-    given = ("--duration", "100", "--between", *pair, "--model", pair[1], "--json", "-")
-    status, plan = run(folder, *given)
+    given = ("--duration", "100", "--between", *pair, "--json", "-")
+    status, plan = run(folder, *given, model="other.json")
     assert status == 0
     data = json.loads(capsys.readouterr().out)
     assert not any("takes no part" in note for note in data["notes"])

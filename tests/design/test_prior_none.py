@@ -10,9 +10,10 @@ from foreign_ships import presets
 
 from greybox.commands.main import main
 
-BRIEF = ["--effort", "0.02", "--workers", "1", "--seed", "1", "--predictor", "basic"]
+ALIKE = ["--workers", "1", "--seed", "1", "--predictor", "basic"]
+BRIEF = [*ALIKE, "--effort", "0.02"]
 # one coefficient in one direction: a plan within seconds
-FAST = [*BRIEF, "--effort", "0.001", "--want", "Xmu", "--regime", "u+", "--margin-u", "0.05"]
+FAST = [*ALIKE, "--effort", "0.001", "--want", "Xmu", "--regime", "u+", "--margin-u", "0.05"]
 
 
 def vessel_file(folder, name, *, known=True, without=()):
