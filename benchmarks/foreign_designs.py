@@ -11,7 +11,9 @@ Trials last sixty lengths, 5 to 15 min. `random` holds settings for half a lengt
 again. `whole` is one plan of 15 min, `stages` three of 5 min, the later ones made by `--after` of
 those before. With `--prior none` there is no first trial: plans begin with main dimensions. What
 stands in DIR is not made again. Errors are those of free runs over one long trial of the operating
-envelope: random steps, zig-zags and turns, to both sides at all speeds.
+envelope: random steps, zig-zags and turns, to both sides at all speeds. Coefficients are compared
+as linear derivatives on a straight course, which every simulator has: slopes of sway and yaw
+accelerations in sway, yaw rate and turn of the helm, by differences on both sides.
 """
 
 from __future__ import annotations
@@ -20,14 +22,16 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 from foreign_ships import presets  # type: ignore[import-not-found]
 from foreign_ships.manoeuvres import (  # type: ignore[import-not-found]
     in_turn,
     random_steps,
+    steady,
     table,
     turning_circle,
     zigzag,
@@ -36,6 +40,8 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from benchmarks.foreign_causes import SAMPLE_TIMES
+from greybox.model.model import ManoeuvringModel, load_model
+from greybox.vessel.force import generalised_force
 from greybox.vessel.toml import load_vessel
 
 Array = NDArray[np.float64]
@@ -65,6 +71,11 @@ MANOEUVRES = {
 }  # fmt: skip
 # lengths of the trial that errors are measured by
 JUDGED = 200
+# share of full ahead on the straight course of linear derivatives, and steps from it: of speeds
+# as a share of the ship's own, of the helm as one of 35 degrees
+AHEAD, STEP, HELM = 0.75, 0.02, 0.1
+# lengths at service speed after which a course is steady
+COURSE = 40
 # plans that are made one after another, and the duration of each [s]
 STAGES, STAGE = 3, 300.0
 
@@ -168,6 +179,69 @@ def vessel_file(name: str, *, dimensions: bool) -> str:
     return "\n".join([*first, ship.vessel_toml(), "[conditions]", f"draught = {ship.draught:g}\n"])
 
 
+def derivatives(
+    name: str, rates: Callable[[Array, Sequence[float]], Array], course: Array, scale: float
+) -> Array:
+    """Return slopes (2, 3) of sway and yaw accelerations in sway, yaw rate and turn of the helm.
+
+    In speeds of the course, lengths and lengths sailed; `scale` is the time of one [s].
+    """
+    ship, speed = presets()[name].ship, course[0]
+    rows = np.array([speed / scale, 1 / scale**2])
+    found = np.empty((2, 3))
+    for k in range(3):
+        apart = []
+        for side in (1.0, -1.0):
+            x = course.copy()
+            if k < 2:
+                x[1 + k] = side * STEP * (speed, 1 / scale)[k]
+            turn = side * HELM if k == 2 else 0.0
+            apart.append(rates(x, ship.helm(AHEAD, turn))[1:3])
+        found[:, k] = (apart[0] - apart[1]) / (2 * (STEP, STEP, HELM)[k]) / rows
+    return found
+
+
+def model_rates(model: ManoeuvringModel) -> Callable[[Array, Sequence[float]], Array]:
+    """Return the accelerations (3,) of a model in still water and air."""
+    s = model.structure
+    step = ca.Function("step", [s.symbols.x, s.symbols.tau], [ca.substitute(
+        s.increment_expression(air_measured=False),
+        ca.vertcat(s.symbols.psi, s.symbols.d, s.symbols.theta),
+        ca.vertcat(0, ca.DM.zeros(len(s.disturbances)), model.theta),
+    )])  # fmt: skip
+
+    def rates(x: Array, commands: Sequence[float]) -> Array:
+        columns = dict(zip(model.vessel.commands, np.array(commands)[:, None], strict=True))
+        made = generalised_force(model.vessel, columns)
+        tau = [made.get(n, np.zeros(1))[0] for n in s.inputs]
+        return np.array(step(x, tau)).ravel() / model.sample_time
+
+    return rates
+
+
+def coefficient_errors(folder: Path, name: str, arms: Mapping[str, object]) -> dict[str, float]:
+    """Return by how much linear derivatives of each arm's model are off, as a share of their size.
+
+    nan where an arm has no model.
+    """
+    ship = presets()[name].ship
+    sailed = presets()[name].sail(steady(AHEAD), COURSE * ship.time_scale)
+    course = np.array([float(sailed.true["u"][-1]), 0.0, 0.0])
+    scale = ship.length / course[0]
+
+    def rates(x: Array, commands: Sequence[float]) -> Array:
+        return np.array(ship.accelerations(x, commands, (0.0, 0.0, 0.0)))
+
+    true, off = derivatives(name, rates, course, scale), {}
+    for arm in arms:
+        path = folder / f"{arm}.json"
+        off[arm] = float("nan")
+        if path.exists():
+            slopes = derivatives(name, model_rates(load_model(path)), course, scale)
+            off[arm] = float(np.linalg.norm(slopes - true) / np.linalg.norm(true))
+    return off
+
+
 def case(
     place: Path, name: str, seed: int, arms: Sequence[str], *, dimensions: bool = False
 ) -> dict[str, list[float]]:
@@ -197,14 +271,22 @@ def paired(logs: Array) -> str:
     return f"{middle:.2f} ({low:.2f} to {high:.2f}) n={n}"
 
 
-def row(name: str, cases: Sequence[dict[str, list[float]]], base: str) -> str:
-    """Return mean fits, and the errors of each other kind of trial over those of `base`."""
+def row(
+    name: str, cases: Sequence[dict[str, list[float]]], base: str, off: Sequence[dict[str, float]]
+) -> str:
+    """Return mean fits, and errors of each other kind of trial over those of `base`.
+
+    First of free runs, then of linear derivatives.
+    """
     fits = {arm: np.array([c[arm] for c in cases]) for arm in cases[0]}
     means = "".join(f"{np.nanmean(f):>12.1f}" for f in fits.values())
     # geometric mean over the states of the rms error in the deviation of each
     errors = {arm: np.log(np.maximum(1 - f / 100, 1e-6)).mean(axis=1) for arm, f in fits.items()}
     others = [arm for arm in errors if arm not in ("first", base)] if base else []
-    told = "".join(f"   {paired(errors[arm] - errors[base]):<24}" for arm in others)
+    slopes = {arm: np.log([o[arm] for o in off]) for arm in errors}
+    told = "".join(
+        f"   {paired(of[arm] - of[base]):<24}" for of in (errors, slopes) for arm in others
+    )
     return f"{name:<24}{means}{told}".rstrip()
 
 
@@ -218,19 +300,25 @@ def main() -> None:
     options = parser.parse_args()
     dimensions = options.prior == "none"
     found: dict[str, list[dict[str, list[float]]]] = {name: [] for name in options.ships}
+    off: dict[str, list[dict[str, float]]] = {name: [] for name in options.ships}
     for seed in options.seeds:
         for name in options.ships:
             found[name].append(case(options.out, name, seed, options.arms, dimensions=dimensions))
+            off[name].append(
+                coefficient_errors(options.out / f"{name}-{seed}", name, found[name][-1])
+            )
             told = {arm: round(float(np.mean(v)), 1) for arm, v in found[name][-1].items()}
             print(f"{name} {seed}: {told}", flush=True)
     base = next((arm for arm in ("plan", "stages") if arm in options.arms), "")
     sailed = [*(() if dimensions else ("first",)), *options.arms]
     others = [arm for arm in options.arms if arm != base] if base else []
     print(f"{'mean held-out fit [%]':<24}" + "".join(f"{arm:>12}" for arm in sailed)
-          + "".join(f"   {f'{x} over {base}':<24}" for x in others) + "   (errors)")  # fmt: skip
+          + "".join(f"   {f'{x} over {base}':<24}" for x in others * 2)
+          + f"   (errors of {len(others)}, then of their derivatives)")  # fmt: skip
     for name, cases in found.items():
-        print(row(name, cases, base))
-    print(row("all", [c for cases in found.values() for c in cases], base))
+        print(row(name, cases, base, off[name]))
+    every = [c for cases in found.values() for c in cases]
+    print(row("all", every, base, [o for one in off.values() for o in one]))
 
 
 if __name__ == "__main__":

@@ -74,9 +74,32 @@ def test_pairs_with_a_failed_trial_are_told_by_their_number(monkeypatch):
     designs = import_module("benchmarks.foreign_designs")
     case = {arm: [80.0, 80.0, 80.0] for arm in ("first", *designs.ARMS)}
     cases = [case, case | {"random": [60.0] * 3}, case | {"zigzag": [np.nan] * 3}]
-    told = designs.row("ship", cases)
+    off = [dict.fromkeys(case, 0.2) for _ in cases]
+    off[1]["random"] = 0.4
+    told = designs.row("ship", cases, "plan", off)
     assert "1.26 (0.47 to 3.40) n=3" in told
     assert "1.00 (1.00 to 1.00) n=2" in told
+    # of linear derivatives, after those of free runs
+    assert told.endswith("1.00 (1.00 to 1.00) n=3")
+    assert "(0.47 to 3.40)" in told.split("n=3", 2)[2]
+
+
+def test_linear_derivatives_are_those_of_the_simulator(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT)
+    designs = import_module("benchmarks.foreign_designs")
+    ship, length, speed = designs.presets()["kvlcc2-7m"].ship, 7.0, 1.0
+    made = np.array([[-0.3, 0.2, 0.05], [-1.1, -2.0, -0.4]])
+    scale = length / speed
+    sizes = np.array([speed / scale, 1 / scale**2])
+
+    def rates(x, commands):
+        turn = commands[1] / ship.helm(designs.AHEAD, 1.0)[1]
+        told = made @ [x[1] / speed, x[2] * scale, turn]
+        # what is even in the motion has no slope on a straight course
+        return np.append(0.0, sizes * (told + 5 * x[1] ** 2))
+
+    found = designs.derivatives("kvlcc2-7m", rates, np.array([speed, 0.0, 0.0]), scale)
+    np.testing.assert_allclose(found, made, atol=1e-9)
 
 
 def test_an_alternative_that_fails_is_not_called_one_that_is_missing(monkeypatch):

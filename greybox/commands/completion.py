@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from greybox.commands.common import say
+from greybox.commands.parser import StoreAction
 
 HELP = "print the script that makes Tab complete commands, options, names and files"
 EXAMPLES = """examples:
@@ -63,6 +64,10 @@ def offer(parser: argparse.ArgumentParser) -> None:
     """Answer the shell that asks, by the protocol of argcomplete, and end the process."""
     from argcomplete import autocomplete
     from argcomplete.completers import BaseCompleter, DirectoriesCompleter, FilesCompleter
+    from argcomplete.finders import safe_actions
+
+    # keeping what was typed before the place that is completed has no effect but that
+    safe_actions.add(StoreAction)
 
     class Offered(BaseCompleter):
         def __call__(

@@ -44,7 +44,7 @@ class Formatter(RawDescriptionRichHelpFormatter):
         return kept._rich_fill_text(self, text, width, indent)
 
 
-class _StoreAction(argparse._StoreAction):
+class StoreAction(argparse._StoreAction):
     """Keeps the value of an option; of one that takes several, those of each repetition."""
 
     def __call__(
@@ -90,7 +90,7 @@ class Parser(argparse.ArgumentParser):
         usual = {"formatter_class": partial(Formatter, max_help_position=26)}
         super().__init__(*given, **usual | named)
         # what `add_argument` makes where it is told no action
-        self.register("action", None, _StoreAction)
+        self.register("action", None, StoreAction)
         self.given: set[str] = set()
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
