@@ -54,22 +54,12 @@ class StoreAction(argparse._StoreAction):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        """Keep what was typed, and refuse a second value where one is meant."""
-        if isinstance(parser, Parser) and option_string:
-            before = getattr(namespace, self.dest) if self.dest in parser.given else None
+        """Keep what was typed; what was typed later of one value alone replaces it."""
+        if isinstance(parser, Parser) and option_string and self.nargs in ("+", "*"):
+            before = getattr(namespace, self.dest) if self.dest in parser.given else []
             parser.given.add(self.dest)
-            if before is not None and self.nargs in ("+", "*"):
-                values = [*before, *values]
-            elif before is not None and before != values:
-                parser.error(
-                    f"{option_string} is given twice, {_as_typed(before)} and "
-                    f"{_as_typed(values)}: keep one of them"
-                )
+            values = [*before, *values]
         setattr(namespace, self.dest, values)
-
-
-def _as_typed(value: Any) -> str:
-    return " ".join(map(str, value)) if isinstance(value, list | tuple) else f"{value}"
 
 
 def sub_parsers(parser: argparse.ArgumentParser) -> dict[str, Parser]:

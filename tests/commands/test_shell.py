@@ -168,7 +168,8 @@ def test_wrong_usage_is_one_sentence_with_the_nearest_name(capsys, line, message
         ("predict m.json turning", "angle", []),
         ("estimate a.csv --vessel V --validate b.csv --validate c.csv", "validate",
          ["b.csv", "c.csv"]),
-        ("estimate a.csv --vessel V --seed 3 --seed 3", "seed", 3),
+        ("estimate a.csv --vessel V --seed 3 --seed 4", "seed", 4),
+        ("design --vessel a --out p --between a b --between c d", "between", ["c", "d"]),
     ],
 )  # fmt: skip
 def test_an_option_that_takes_several_adds_up_when_it_is_repeated(line, name, values):
@@ -187,22 +188,6 @@ def test_options_that_take_several_all_add_up():
                 alone = parser.for_parts()
                 both = vars(alone.parse_args([option, values[0], option, values[1]]))
                 assert both[action.dest] == values, f"{name} {option}"
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("estimate a.csv --vessel V --seed 0 --seed 1", "--seed is given twice, 0 and 1: keep one"),
-        ("design --vessel a --vessel b --out p.csv", "--vessel is given twice, a and b: keep one"),
-        ("design --vessel a --out p --between a b --between c d",
-         "--between is given twice, a b and c d: keep one"),
-    ],
-)  # fmt: skip
-def test_a_second_value_where_one_is_meant_is_refused(capsys, line, message):
-    with pytest.raises(SystemExit) as stopped:
-        main(line.split())
-    assert stopped.value.code == 2
-    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
