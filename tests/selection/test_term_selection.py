@@ -159,15 +159,19 @@ def test_what_the_log_cannot_tell_from_damping_is_damping(modulus_log):
 
 
 def test_a_published_structure_stays_where_it_follows_within_noise():
-    found = estimate_model([virtual_log(4, 3000, wind=0.0, spread=1e-12, current=(0.0, 0.0))])
+    found = estimate_model([virtual_log(4, 600, wind=0.0, spread=1e-12, current=(0.0, 0.0))])
     assert found.predictor.structure.name.startswith(("thesis", "linear"))
     assert not any("selected" in note for note in found.notes)
 
 
-@pytest.mark.parametrize("method", ["oe", "iv"])
-@pytest.mark.parametrize(("error", "leaves"), [(0.0052, True), (0.005, False)])
-def test_a_channel_that_moves_little_counts_by_its_error_beyond_noise(method, error, leaves):
-    sway = SimpleNamespace(rmse=error, noise=0.0049, spread=0.0144, moves=False)
+@pytest.mark.parametrize(
+    ("method", "error", "own", "leaves"),
+    [("oe", 0.006, 0.0058, True), ("oe", 0.006, 0.005, False), ("oe", 0.0052, 0.0058, False),
+     # instruments leave their own log by the noise of their coefficients too
+     ("iv", 0.0052, 0.005, True), ("iv", 0.005, 0.0058, False)],
+)  # fmt: skip
+def test_a_channel_that_moves_little_counts_by_its_error_beyond_noise(method, error, own, leaves):
+    sway = SimpleNamespace(rmse=error, own=own, noise=0.0049, spread=0.0144, moves=False)
     judged = SimpleNamespace(because=(), channels=(sway,))
     assert _leaves_more(SimpleNamespace(method=method, prediction=judged)) is leaves
     judged.because = (SomeHeldDiverge({"n": 10.0}, 60.0, 1, 16),)
