@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 _MOVED = ("angle", "rudder", "speed")
 # no rudder passes a right angle; an azimuth whose angle is not wrapped may make two turns [rad]
 _FARTHEST = {"rudder": math.pi / 2, "angle": 4 * math.pi}
-# fastest angle of a servo [rad/s] at 1 m; by Froude it falls with the root of the length
-_FASTEST = 10.0
 _CORRECTED = ("x_n", "y_n", "psi", "u", "v", "r", "u_q", "v_q")
 _log = logging.getLogger(__name__)
 EXAMPLES = ("thesis", "ferry")
@@ -114,8 +112,6 @@ def vessel_from_dict(data: dict[str, Any], source: str = "") -> Vessel:
 
     table = checked(data, source)
     thrusters = tuple(_thruster(t, f"thruster {i}") for i, t in enumerate(table.thruster, 1))
-    for i, thruster in enumerate(thrusters, 1):
-        _require_possible_rates(thruster, f"thruster {i}", table.length)
     loop = table.closed_loop
     vessel = Vessel(
         name=table.name,
@@ -230,18 +226,6 @@ def _limits(row: Mapping[str, Any], key: str, where: str) -> Limits:
             f"are possible: write radians, {math.radians(farthest):.4g} for {farthest:g} deg."
         )
     return Limits(lower, upper, row.get(f"{key}_rate"))
-
-
-def _require_possible_rates(thruster: Thruster, where: str, length: float) -> None:
-    """Refuse angles that no machinery of a ship of this length turns so fast."""
-    fastest = _FASTEST / math.sqrt(length)
-    for kind, _, _, limits in thruster.movements:
-        if kind != "speed" and limits.rate is not None and limits.rate > max(fastest, 1.0):
-            raise VesselError(
-                f"{kind}_rate of {where} is {limits.rate:g} rad/s, and at a length of {length:g} m "
-                f"{max(fastest, 1.0):.3g} rad/s at most are possible: write radians, "
-                f"{math.radians(limits.rate):.4g} for {limits.rate:g} deg/s."
-            )
 
 
 def _thrust(law: Any) -> ThrustLaw:

@@ -298,13 +298,9 @@ RUDDER = {"type": "propeller_rudder", "x": -1.0, "speed": "n", "rudder": "d"}
 
 
 def test_rates_of_angles_are_not_degrees_per_second():
-    big = {"name": "ship", "length": 105.0}
-    with pytest.raises(VesselError, match=r"3 rad/s, .* 105 m 1 rad/s .* 0\.05236 for 3 deg/s"):
-        vessel_from_dict({**big, "thruster": [{**RUDDER, "rudder_rate": 3}]})
-    with pytest.raises(VesselError, match=r"angle_rate of thruster 1 is 12 rad/s"):
-        vessel_from_dict({**big, "thruster": [{**AZIMUTH, "angle_rate": 12}]})
-    # servos of models are quick, and deg/s of a model are possible
     model = {"name": "model", "length": 2.0}
+    azimuth = vessel_from_dict({**model, "thruster": [{**AZIMUTH, "angle_rate": 12}]})
+    assert "angle_rate of thruster 1 is 12 rad/s" in azimuth.doubts[0]
     quick = vessel_from_dict({**model, "thruster": [{**RUDDER, "rudder_rate": 3}]})
     assert "write radians, 0.05236 if 3 deg/s is meant" in quick.doubts[0]
     for rate in (0.3, 1.0):
