@@ -23,8 +23,11 @@ information that only several trials can have and that may exceed any one trial'
     pip install ".[bench-design]"
 
 cyipopt needs an IPOPT and Pyomo's ``pynumero_ASL``: `pip install cyipopt` with
-``PKG_CONFIG_PATH`` at ``casadi/pkgconfig`` builds it against CasADi's IPOPT. An
-``ipopt`` executable on the path is used in its place.
+``PKG_CONFIG_PATH`` at ``casadi/pkgconfig`` builds it against CasADi's IPOPT (where the
+paths in its ``ipopt.pc`` are those of its build, a copy with CasADi's own folder). The
+library is ``AmplInterface.cpp`` of ``pyomo/contrib/pynumero/src``, compiled as a shared
+object with Debian's ``libamplsolver-dev`` and put in ``~/.pyomo/lib``. An ``ipopt``
+executable on the path is used in place of both.
 """
 
 from __future__ import annotations
