@@ -24,7 +24,8 @@ def table(parser):
     for action in parser._actions:
         name = ", ".join(action.option_strings) or action.dest
         found[name] = {
-            "action": type(action).__name__,
+            # the library's own kind, whatever this shell adds to it
+            "action": next(c.__name__ for c in type(action).__mro__ if c.__module__ == "argparse"),
             "dest": action.dest,
             "nargs": action.nargs,
             "const": action.const,
