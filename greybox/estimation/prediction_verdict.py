@@ -257,7 +257,7 @@ class Elsewhere(Reason):
 
 @dataclass(frozen=True)
 class HeldCommandsDiverge(Reason):
-    """The free run leaves its bound where commands are held as they once were in the logs.
+    """The free run diverges, or goes astern, where commands are held as they were in the logs.
 
     Parameters
     ----------
@@ -281,8 +281,9 @@ class HeldCommandsDiverge(Reason):
         """At which commands, and when."""
         at = ", ".join(f"{name} {value:.3g}" for name, value in self.commands.items())
         return (
-            f"its free run diverges with {self.count} of {self.settings} settings of the commands "
-            f"of the logs, each held constant, first after {self.after:.3g} s ({at})"
+            f"its free run diverges or goes astern with {self.count} of {self.settings} settings "
+            f"of the commands of the logs, each held constant, first after {self.after:.3g} s "
+            f"({at})"
         )
 
 
