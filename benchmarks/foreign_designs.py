@@ -50,7 +50,7 @@ SHIPS = (
     "kvlcc2-7m", "esso-osaka-3m", "training-ship-105m", "research-catamaran-29m",
     "survey-catamaran-2m",
 )  # fmt: skip
-ARMS = ("random", "zigzag", "plan", "long-random", "long-zigzag", "whole", "stages")
+ARMS = ("random", "zigzag", "plan", "long-random", "long-zigzag", "whole", "stages", "limited")
 # lengths sailed in a trial, its least and its greatest duration [s]
 TRIAL, SHORTEST, LONGEST = 60, 300.0, 900.0
 STEPS = random_steps(hold=(0.5, 2.0))
@@ -78,6 +78,8 @@ AHEAD, STEP, HELM = 0.75, 0.02, 0.1
 COURSE = 40
 # plans that are made one after another, and the duration of each [s]
 STAGES, STAGE = 3, 300.0
+# half the side of the square of `limited` plans, in lengths
+ROOM = 16
 
 
 def greybox(*arguments: object) -> str:
@@ -117,8 +119,41 @@ def sail(folder: Path, name: str, arm: str, seed: int) -> list[Path]:
         trial = preset.sail(MANOEUVRES[arm], lasting(name, arm), seed=number)
         trial.write_csv(log, _every(name))
     elif arm not in MANOEUVRES:
-        _sail_planned(log, name, _prior(folder, name, seed, lasting(name, arm)), number, seed)
+        made = _prior(folder, name, seed, lasting(name, arm))
+        if arm == "limited":
+            made = (*made, *_limits(folder, name))
+        _sail_planned(log, name, made, number, seed)
     return [log]
+
+
+def _square(name: str) -> float:
+    """Return half the side of the sea room of `limited` plans [m]."""
+    return float(ROOM * presets()[name].ship.length)
+
+
+def _limits(folder: Path, name: str) -> list[object]:
+    """Return the limits of a `limited` plan as options of `greybox design`."""
+    half, first = _square(name), np.genfromtxt(folder / "first.csv", delimiter=",", names=True)
+    area = folder / "area.csv"
+    corners = [(1, 1), (1, -1), (-1, -1), (-1, 1)]
+    area.write_text("x_n,y_n\n" + "".join(f"{half * x:g},{half * y:g}\n" for x, y in corners))
+    speed = np.hypot(first["u"], first["v"]).max()
+    return ["--area", area, "--speed-cap", speed, "--yaw-cap", np.abs(first["r"]).max()]
+
+
+def kept(folder: Path, name: str, true: Mapping[str, Array]) -> None:
+    """Write what a `limited` plan stated and by which share of each limit the ship was within."""
+    typed = [float(x) for x in _limits(folder, name)[3::2]]
+    bounds = dict(zip(("room", "speed", "yaw"), (_square(name), *typed), strict=True))
+    reached = {
+        "room": max(np.abs(true["x_n"]).max(), np.abs(true["y_n"]).max()),
+        "speed": np.hypot(true["u"], true["v"]).max(),
+        "yaw": np.abs(true["r"]).max(),
+    }
+    left = {limit: round(1 - float(reached[limit]) / b, 4) for limit, b in bounds.items()}
+    plan = json.loads((folder / "limited.design.json").read_text())
+    told = {"stated": plan["keeps_limits"]["probability"], "left": left}
+    (folder / "limited.kept").write_text(json.dumps(told))
 
 
 def _every(name: str) -> int:
@@ -144,14 +179,17 @@ def _sail_planned(log: Path, name: str, made: Sequence[object], number: int, see
     rows = np.genfromtxt(plan, delimiter=",", names=True)
     commands = np.column_stack([rows[a.column] for a in preset.ship.actuators])
     trial = preset.sail(
-        table(rows["t"], commands), float(rows["t"][-1]), seed=number, start_speed=_begun(log)
-    )
+        table(rows["t"], commands), float(rows["t"][-1]), seed=number, start_speed=_begun(log),
+        start_heading=_begun(log, "psi"),
+    )  # fmt: skip
+    if log.stem == "limited":
+        kept(log.parent, name, trial.true)
     trial.write_csv(log, _every(name))
 
 
-def _begun(log: Path) -> float:
-    """Return the speed ahead from which a planned trial sets out [m/s]."""
-    return float(json.loads(log.with_suffix(".design.json").read_text())["starts"][0]["u"])
+def _begun(log: Path, state: str = "u") -> float:
+    """Return the speed ahead [m/s], or another state, from which a planned trial sets out."""
+    return float(json.loads(log.with_suffix(".design.json").read_text())["starts"][0][state])
 
 
 def fit(folder: Path, name: str, arm: str, seed: int) -> list[float]:
@@ -317,6 +355,12 @@ def main() -> None:
           + f"   (errors of {len(others)}, then of their derivatives)")  # fmt: skip
     for name, cases in found.items():
         print(row(name, cases, base, off[name]))
+    told = sorted(options.out.glob("*/limited.kept")) if "limited" in options.arms else []
+    for path in told:
+        one = json.loads(path.read_text())
+        within = all(left >= 0 for left in one["left"].values())
+        print(f"{path.parent.name:<28}limits {'kept' if within else 'passed'}, stated "
+              f"{one['stated']:.2f}, left {one['left']}")  # fmt: skip
     every = [c for cases in found.values() for c in cases]
     print(row("all", every, base, [o for one in off.values() for o in one]))
 

@@ -459,6 +459,35 @@ class HardlyMoved(Reason):
 
 
 @dataclass(frozen=True)
+class NoisierThanStated(Reason):
+    """Errors are mostly white, and far above the noise that the vessel file states.
+
+    Parameters
+    ----------
+    channel, unit : str
+    seen, stated : float
+        Standard deviation of the white noise in the errors, and that of the vessel file [unit].
+    """
+
+    channel: str
+    unit: str
+    seen: float
+    stated: float
+
+    kind: ClassVar[str] = "noisier_than_stated"
+    fatal: ClassVar[bool] = False
+
+    @property
+    def sentence(self) -> str:
+        """Both levels, and where to write the true one."""
+        return (
+            f"errors of {channel_words(self.channel)} are mostly white noise of {self.seen:.2g} "
+            f"{self.unit}, and the vessel file states {self.stated:.2g}: if its sensor is that "
+            f"noisy, write {self.channel}_std = {self.seen:.2g} under [sensors]"
+        )
+
+
+@dataclass(frozen=True)
 class NoBands(Reason):
     """The bands could not be judged.
 

@@ -17,6 +17,7 @@ from greybox.estimation.prediction_verdict import (
     Elsewhere,
     JudgedOn,
     NoBands,
+    NoisierThanStated,
     PredictionVerdict,
     RefitsDiverge,
     RunsDiverge,
@@ -166,6 +167,7 @@ def judge_prediction(
         beyond = {s: float(v) for s, v, m in zip(states, far / wide, moves, strict=True) if m}
     if apart and (lost or any(not v <= LIMITS.good for v in beyond.values())):
         reasons.append(Elsewhere(tuple(kinds), len(own) > 1, beyond, lost, len(apart)))
+    reasons += _noisy(held, states, rmse)
     return weigh_prediction(
         channels,
         judged_on,
@@ -257,6 +259,24 @@ def _noise(held: Sequence[HeldOut], states: tuple[str, ...]) -> Array:
         if told:
             out[i] = min(told)
     return out
+
+
+def _noisy(held: Sequence[HeldOut], states: tuple[str, ...], rmse: Array) -> list[Reason]:
+    """Return the channels whose errors are mostly white and far above the noise that is stated.
+
+    What a run leaves, not the measurements: coarsely sampled motion is rough too. Of velocities
+    derived from positions the vessel file states nothing.
+    """
+    reasons: list[Reason] = []
+    derived = any(h.run.log.provenance.velocities_derived for h in held)
+    for i, state in enumerate(states):
+        stated = None if derived else held[0].run.log.vessel.std(state)
+        logs = [(h.run.log, h.run.x[:, i]) for h in held]
+        seen = white_noise([log.measured(state) - x for log, x in logs])
+        if stated and seen and seen > LIMITS.noise * stated and seen**2 > rmse[i] ** 2 / 2:
+            unit = CHANNELS[state].unit if state in CHANNELS else ""
+            reasons.append(NoisierThanStated(state, unit, seen, stated))
+    return reasons
 
 
 def _moves(

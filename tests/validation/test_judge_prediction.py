@@ -14,6 +14,7 @@ from greybox.estimation.prediction_verdict import (
     BandShare,
     ChannelPrediction,
     JudgedOn,
+    NoisierThanStated,
     NothingHeldOut,
     PredictionLevel,
     RunsDiverge,
@@ -172,6 +173,23 @@ def test_what_hardly_moves_does_not_decide():
     assert nothing.text == (
         "poor: no channel moved beyond its noise, so its prediction was not tested"
     )
+
+
+def test_a_sensor_that_is_noisier_than_stated_is_told(log):
+    """White noise of ten times the stated level in sway, on a ship that is known."""
+    stated = replace(log, vessel=replace(log.vessel, sensors={"v_std": SIGMA / 3}))
+    rng = np.random.default_rng(5)
+    noisy = log["v"] + 3 * SIGMA * rng.standard_normal(len(log))
+    rough = replace(stated, channels={**stated.channels, "v": noisy})
+    found = judge_prediction([HeldOut.of(true_model(log), rough)], JudgedOn.VALIDATION)
+    (told,) = [r for r in found.because if isinstance(r, NoisierThanStated)]
+    # the third differences of n = 600 samples tell a deviation to some 5 %
+    assert told.seen == pytest.approx(np.sqrt(10) * SIGMA, rel=0.2)
+    assert f"v_std = {told.seen:.2g} under [sensors]" in told.sentence
+    assert told.sentence in found.reasons
+    # errors of a model that is wrong are smooth: they are no sensor's
+    wrong = judge_prediction([HeldOut.of(true_model(log, Ymu=1.4), stated)], JudgedOn.VALIDATION)
+    assert not any(isinstance(r, NoisierThanStated) for r in wrong.because)
 
 
 def test_bands_that_miss_limit_the_model_where_that_is_certain():
