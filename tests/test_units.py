@@ -35,7 +35,7 @@ def test_no_spelling_or_suffix_stands_for_two_units():
     [
         ("°", "deg"), ("Degrees", "deg"), (" kts ", "kn"), ("KNOTS", "kn"), ("m s-1", "m/s"),
         ("M/S", "m/s"), ("°/s", "deg/s"), ("n", "N"), ("kN", "kN"), ("KN", "kn"), ("µs", "us"),
-        ("minutes", "min"), ("Percent", "%"), ("%", "%"), ("furlong", None), ("", None), ("1", None),
+        ("minutes", "min"), ("Percent", "%"), ("furlong", None), ("", None), ("1", None),
     ],
 )  # fmt: skip
 def test_spellings(text, symbol):
