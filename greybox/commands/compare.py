@@ -16,7 +16,7 @@ from greybox.commands.common import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from greybox.commands.time_left import Stage
     from greybox.model.model import ManoeuvringModel
@@ -95,6 +95,18 @@ def _own_logs(name: str, model: ManoeuvringModel, hashes: Sequence[str]) -> str:
     return told if count else ""
 
 
+def _beyond(named: Mapping[str, ManoeuvringModel], held: Sequence[list[TrialLog]]) -> list[str]:
+    """Say which models the logs take beyond what they were estimated on, each sentence once."""
+    from greybox.trial.validity import extrapolation_note
+
+    said: dict[str, list[str]] = {}
+    for k, (name, model) in enumerate(named.items()):
+        known = model.record.get("ranges") or {}
+        if note := extrapolation_note(known, [logs[k] for logs in held]):
+            said.setdefault(note, []).append(f"'{name}'")
+    return [f"{', '.join(names)}: {note}" for note, names in said.items()]
+
+
 def stages(options: argparse.Namespace) -> list[Stage]:
     """Return the shares of the time that each stage usually takes."""
     return [("reading", 15.0), ("comparing", 25.0), *drawn(options, 60.0)]
@@ -127,7 +139,7 @@ def run(options: argparse.Namespace) -> None:
     read: list[str] = []
     told: list[str] = []
     columns: Iterable[list[TrialLog]] = _read_each(files, models, read, told)
-    whole = None
+    whole, beyond = None, list[str]()
     if estimated_rows(files) * len(models) * BYTES > options.memory * 2**30:
         from greybox.report.comparison import MOST_LOGS
 
@@ -136,6 +148,7 @@ def run(options: argparse.Namespace) -> None:
         # a log that cannot be read is told before the others are compared
         held = list(columns)
         require_distinct([logs[0] for logs in held])
+        beyond = _beyond(named, held)
         columns = counted("comparing logs", held)
     comparison = compare_each(
         named, columns, heading=options.heading, bands=not options.no_bands, seed=options.seed,
@@ -144,7 +157,7 @@ def run(options: argparse.Namespace) -> None:
     misnamed = (n for m in models for n in misnamed_columns(read, m.vessel))
     of = [run.log.provenance for run in comparison.runs[0]]
     own = (_own_logs(name, model, [p.sha256 for p in of]) for name, model in named.items())
-    notes = dict.fromkeys(filter(None, (*own, *told, *misnamed)))
+    notes = dict.fromkeys(filter(None, (*own, *beyond, *told, *misnamed)))
     comparison = replace(comparison, notes=tuple(notes))
     record = provenance(options) | {"logs": [f"{p.source} {p.sha256[:12]}" for p in of]}
 

@@ -29,7 +29,12 @@ from greybox.selection.prediction import require_distinct, require_others
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.trial.segments import as_segments
-from greybox.trial.validity import other_conditions, pooled_conditions
+from greybox.trial.validity import (
+    extrapolation_note,
+    other_conditions,
+    pooled_conditions,
+    ranges,
+)
 from greybox.validation.fit import at_model_rate
 
 _log = logging.getLogger(__name__)
@@ -198,6 +203,10 @@ def diagnose(
     if model is not None:
         conditions = (*conditions, *other_conditions(model.conditions, case.logs))
     notes += [d.sentence for d in conditions]
+    if ready.validate:
+        seen = ranges(case.logs, ready.structure.states)
+        said = extrapolation_note(seen, ready.validate)
+        notes += [said] if said else []
     causes = causes_of(ready.findings, ready.causes, ready.tried)
     if causes:
         notes.append(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.channels import MOTION_WORDS
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import shortened
 from greybox.vessel.conditions import UNITS, Conditions, Value, spelled, words
@@ -35,6 +36,9 @@ _SEA = 2
 _MOST_NAMED = 3
 # share of the samples left out at either end of a range: single ones are outliers
 _TAIL = 1e-3
+# share of a range by which a log may be outside it, as logs of one kind of trial are; share of its
+# samples that is told; signals are named by their samples outside, as a share of the most of any
+_SLACK, _OFTEN, _PART = 0.25, 0.05, 0.1
 # settings that stand for all of a log
 _SETTINGS = 16
 
@@ -226,6 +230,52 @@ def ranges(logs: Sequence[TrialLog], states: Sequence[str]) -> dict[str, tuple[f
             before = found.get(name, (low, high))
             found[name] = min(low, before[0]), max(high, before[1])
     return found
+
+
+def extrapolation_note(known: Mapping[str, tuple[float, float]], logs: Sequence[TrialLog]) -> str:
+    """Say for how long logs leave the ranges of those of a model, ``""`` where they hardly do.
+
+    Parameters
+    ----------
+    known : mapping of str to (float, float)
+        `ranges` of the logs that the model was estimated on.
+    logs : sequence of TrialLog
+        Of one vessel, such as logs held out.
+    """
+    total = sum(len(log.t) for log in logs)
+    beyond: dict[str, int] = {}
+    left = 0
+    for log in logs:
+        outside = {n: _outside(log[n], *span) for n, span in known.items() if n in log}
+        left += int(np.any([*outside.values(), np.zeros(len(log.t), bool)], axis=0).sum())
+        beyond |= {n: beyond.get(n, 0) + int(x.sum()) for n, x in outside.items()}
+    if left < _OFTEN * total:
+        return ""
+    most = max(beyond.values())
+    far = [n for n, count in beyond.items() if count >= _PART * most]
+    seen = ranges(logs, far)
+    said = ", ".join(_spans(n, seen[n], known[n], logs[0]) for n in far)
+    names = shortened([log.name for log in logs], _MOST_NAMED)
+    leave = "leaves" if len(logs) == 1 else "leave"
+    return (
+        f"{names} {leave} what the model was estimated on for {100 * left / total:.0f} % of the "
+        f"time: {said}. Errors there are those of extrapolation: to predict so far, estimate with "
+        f"a log that goes there too."
+    )
+
+
+def _outside(value: Array, low: float, high: float) -> NDArray[np.bool_]:
+    slack = max(_SLACK * (high - low), 0.01 * max(abs(low), abs(high)))
+    return np.asarray((value < low - slack) | (value > high + slack))
+
+
+def _spans(name: str, seen: tuple[float, float], known: tuple[float, float], log: TrialLog) -> str:
+    factor, unit = 1.0, {"u": " m/s", "v": " m/s"}.get(name, "")
+    if name == "r" or name in log.vessel.angle_commands:
+        factor, unit = 180 / np.pi, " deg/s" if name == "r" else " deg"
+    a, b, low, high = (factor * x for x in (*seen, *known))
+    said = MOTION_WORDS.get(name, name)
+    return f"{said} {a:z.3g} to {b:z.3g}{unit} (estimated on {low:z.3g} to {high:z.3g})"
 
 
 def settings_of(logs: Sequence[TrialLog]) -> dict[str, list[float]]:
