@@ -16,13 +16,14 @@ from greybox.commands.common import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from greybox.commands.time_left import Stage
     from greybox.model.model import ManoeuvringModel
     from greybox.report.page import Page
     from greybox.trial.log import TrialLog
     from greybox.trial.log_files import LogFile
+    from greybox.trial.validity import Excursions
 
 HELP = "compare free runs of models with logs: fit, errors, bands, plots"
 EXAMPLES = """examples:
@@ -95,16 +96,22 @@ def _own_logs(name: str, model: ManoeuvringModel, hashes: Sequence[str]) -> str:
     return told if count else ""
 
 
-def _beyond(named: Mapping[str, ManoeuvringModel], held: Sequence[list[TrialLog]]) -> list[str]:
-    """Say which models the logs take beyond what they were estimated on, each sentence once."""
-    from greybox.trial.validity import extrapolation_note
+def _followed(
+    columns: Iterable[list[TrialLog]], excursions: Sequence[Excursions]
+) -> Iterator[list[TrialLog]]:
+    """Yield each log, after telling of it for each model."""
+    for logs in columns:
+        for found, log in zip(excursions, logs, strict=True):
+            found.add(log)
+        yield logs
 
+
+def _beyond(names: Sequence[str], excursions: Sequence[Excursions]) -> list[str]:
+    """Say which models the logs take beyond what they were estimated on, each sentence once."""
     said: dict[str, list[str]] = {}
-    for k, (name, model) in enumerate(named.items()):
-        known = model.record.get("ranges") or {}
-        if note := extrapolation_note(known, [logs[k] for logs in held]):
-            said.setdefault(note, []).append(f"'{name}'")
-    return [f"{', '.join(names)}: {note}" for note, names in said.items()]
+    for name, found in zip(names, excursions, strict=True):
+        said.setdefault(found.sentence, []).append(f"'{name}'")
+    return [f"{', '.join(of)}: {sentence}" for sentence, of in said.items() if sentence]
 
 
 def stages(options: argparse.Namespace) -> list[Stage]:
@@ -124,6 +131,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.trial.checks.check import misnamed_columns, require_each_once
     from greybox.trial.log_files import find_logs
     from greybox.trial.stream import estimated_rows
+    from greybox.trial.validity import Excursions
     from greybox.validation.comparison import BYTES, compare_each
 
     check_targets(options.json, options.report)
@@ -138,8 +146,9 @@ def run(options: argparse.Namespace) -> None:
     require_each_once([file.path for file in files])
     read: list[str] = []
     told: list[str] = []
-    columns: Iterable[list[TrialLog]] = _read_each(files, models, read, told)
-    whole, beyond = None, list[str]()
+    excursions = [Excursions(m.record.get("ranges") or {}) for m in models]
+    columns: Iterable[list[TrialLog]] = _followed(_read_each(files, models, read, told), excursions)
+    whole = None
     if estimated_rows(files) * len(models) * BYTES > options.memory * 2**30:
         from greybox.report.comparison import MOST_LOGS
 
@@ -148,7 +157,6 @@ def run(options: argparse.Namespace) -> None:
         # a log that cannot be read is told before the others are compared
         held = list(columns)
         require_distinct([logs[0] for logs in held])
-        beyond = _beyond(named, held)
         columns = counted("comparing logs", held)
     comparison = compare_each(
         named, columns, heading=options.heading, bands=not options.no_bands, seed=options.seed,
@@ -157,7 +165,7 @@ def run(options: argparse.Namespace) -> None:
     misnamed = (n for m in models for n in misnamed_columns(read, m.vessel))
     of = [run.log.provenance for run in comparison.runs[0]]
     own = (_own_logs(name, model, [p.sha256 for p in of]) for name, model in named.items())
-    notes = dict.fromkeys(filter(None, (*own, *beyond, *told, *misnamed)))
+    notes = dict.fromkeys(filter(None, (*own, *_beyond(names, excursions), *told, *misnamed)))
     comparison = replace(comparison, notes=tuple(notes))
     record = provenance(options) | {"logs": [f"{p.source} {p.sha256[:12]}" for p in of]}
 
