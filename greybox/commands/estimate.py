@@ -84,8 +84,8 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--structure",
         metavar="NAME",
-        help="thesis, surge, linear, blanke, modulus, abkowitz; +TERM and -TERM change it; "
-        "chosen by default",
+        help="thesis, surge, linear, blanke, modulus, abkowitz; +TERM and -TERM change it, in "
+        "quotes where a TERM holds |; chosen by default",
     )
     group.add_argument(
         "--effort",
