@@ -190,6 +190,12 @@ def diagnose(
         lines.append(find_waves(white.nu, white.errors, names, problem.sample_time))
     say("gain")
     notes = paced
+    if options.causes and (idle := ready.untried()):
+        notes.append(
+            f"{', '.join(idle)} {'were' if len(idle) > 1 else 'was'} asked for and not tried, "
+            f"since these logs cannot show it or the model has it: a wind, for one, must have been "
+            f"measured."
+        )
     if apart and not any(c.hypothesis.key in apart for c in found.causes):
         notes.append(
             f"{', '.join(apart)} would help, but positions, heading and velocities of these logs "
