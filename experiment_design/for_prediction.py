@@ -59,6 +59,8 @@ _TIGHTENINGS = 3
 _UNKNOWN_MISFIT, _DIAGNOSED = 0.3, "diagnosed"
 # deviations of its sensor within which the sign of sway is not known (A10)
 _CLOSE = 3.0
+# share of a trial near zero from which on nothing useful is left when that is cut out
+_MOSTLY = 0.5
 # what a plan is compared with, in words
 RANDOM_SETTINGS = f"the best of {RANDOM} random sequences of settings of the operating envelope"
 # of the range of a speed in the prior's trial: what the plan may go beyond; slowest speed
@@ -185,12 +187,7 @@ class PredictionDesign:
             f"turn, judges an estimate of the rest, then joins it (--plan of greybox estimate)",
         ]
         if self.crossings:
-            part = sum(b - a for a, b in self.crossings) / r.duration
-            lines.append(
-                f"sway comes within {_CLOSE:g} standard deviations of its noise from zero "
-                f"{len(self.crossings)} times, {100 * part:.0f} % of the trial: --margin-v of "
-                f"greybox estimate cuts these samples (Remark 4.2)"
-            )
+            lines.append(_crossed(self.crossings, r.duration))
         if self.design.keeping is not None:
             lines.append(self.design.keeping.sentence())
         if (gain := self.design.efficiency_vs_random) is not None:
@@ -199,6 +196,22 @@ class PredictionDesign:
             )
         lines += self.design.missed()
         return "\n".join([*lines, *[f"Note: {n}" for n in self.design.notes]])
+
+
+def _crossed(crossings: Sequence[tuple[float, float]], duration: float) -> str:
+    """Say how much of a trial sway spends near zero, and what to do about it."""
+    part = sum(b - a for a, b in crossings) / duration
+    near = f"within {_CLOSE:g} standard deviations of its noise"
+    if part > _MOSTLY:
+        return (
+            f"sway stays {near} for {100 * part:.0f} % of the trial, so it tells little of sway: "
+            f"a less noisy velocity would; --margin-v of greybox estimate would cut these samples"
+        )
+    times = f"{len(crossings)} times" if len(crossings) > 1 else "once"
+    return (
+        f"sway comes {near} from zero {times}, {100 * part:.0f} % of the trial: --margin-v of "
+        f"greybox estimate cuts these samples (Remark 4.2)"
+    )
 
 
 def command_ranges(

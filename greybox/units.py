@@ -68,6 +68,8 @@ UNITS: dict[str, Unit] = {
         Unit("deg/min", "rad/s", _DEGREE / 60.0, ("°/min",), ("deg_min", "degpm")),
         Unit("rpm", "rpm", 1.0, ("1/min",), ("rpm",)),
         Unit("rps", "rps", 1.0, ("1/s", "hz"), ("rps",)),
+        # of full thrust or speed: kept as it is, like any speed of a propeller
+        Unit("%", "%", 1.0, ("percent", "per cent", "pct")),
         Unit("N", "N", 1.0, ("n", "newton", "newtons")),
         Unit("kN", "N", 1e3),
         Unit("1", "1", 1.0),

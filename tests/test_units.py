@@ -35,7 +35,7 @@ def test_no_spelling_or_suffix_stands_for_two_units():
     [
         ("°", "deg"), ("Degrees", "deg"), (" kts ", "kn"), ("KNOTS", "kn"), ("m s-1", "m/s"),
         ("M/S", "m/s"), ("°/s", "deg/s"), ("n", "N"), ("kN", "kN"), ("KN", "kn"), ("µs", "us"),
-        ("minutes", "min"), ("furlong", None), ("", None), ("1", None),
+        ("minutes", "min"), ("Percent", "%"), ("furlong", None), ("", None), ("1", None),
     ],
 )  # fmt: skip
 def test_spellings(text, symbol):
@@ -119,6 +119,12 @@ def test_no_propeller_speed_is_an_angle(unit):
         unit_factor(unit, None, "n")
 
 
-@pytest.mark.parametrize("unit", ["rpm", "rps", "rad/s", "kN", "1"])
+@pytest.mark.parametrize("unit", ["rpm", "rps", "rad/s", "kN", "%", "1"])
 def test_what_stands_for_a_propeller_speed(unit):
     assert unit_factor(unit, None, "n") > 0
+
+
+def test_percents_of_a_motor_stay_percents():
+    assert unit_factor("%", None, "n") == unit_factor("percent", None, "n") == 1.0
+    with pytest.raises(LogError, match="in '%' but its channel is in 'rad'"):
+        unit_factor("%", "rad", "delta")

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from greybox.report.page import Page
     from greybox.trial.log import TrialLog
     from greybox.trial.log_files import LogFile
+    from greybox.trial.validity import Excursions
 
 HELP = "compare free runs of models with logs: fit, errors, bands, plots"
 EXAMPLES = """examples:
@@ -95,6 +96,24 @@ def _own_logs(name: str, model: ManoeuvringModel, hashes: Sequence[str]) -> str:
     return told if count else ""
 
 
+def _followed(
+    columns: Iterable[list[TrialLog]], excursions: Sequence[Excursions]
+) -> Iterator[list[TrialLog]]:
+    """Yield each log, after telling of it for each model."""
+    for logs in columns:
+        for found, log in zip(excursions, logs, strict=True):
+            found.add(log)
+        yield logs
+
+
+def _beyond(names: Sequence[str], excursions: Sequence[Excursions]) -> list[str]:
+    """Say which models the logs take beyond what they were estimated on, each sentence once."""
+    said: dict[str, list[str]] = {}
+    for name, found in zip(names, excursions, strict=True):
+        said.setdefault(found.sentence, []).append(f"'{name}'")
+    return [f"{', '.join(of)}: {sentence}" for sentence, of in said.items() if sentence]
+
+
 def stages(options: argparse.Namespace) -> list[Stage]:
     """Return the shares of the time that each stage usually takes."""
     return [("reading", 15.0), ("comparing", 25.0), *drawn(options, 60.0)]
@@ -112,6 +131,7 @@ def run(options: argparse.Namespace) -> None:
     from greybox.trial.checks.check import misnamed_columns, require_each_once
     from greybox.trial.log_files import find_logs
     from greybox.trial.stream import estimated_rows
+    from greybox.trial.validity import Excursions
     from greybox.validation.comparison import BYTES, compare_each
 
     check_targets(options.json, options.report)
@@ -126,7 +146,8 @@ def run(options: argparse.Namespace) -> None:
     require_each_once([file.path for file in files])
     read: list[str] = []
     told: list[str] = []
-    columns: Iterable[list[TrialLog]] = _read_each(files, models, read, told)
+    excursions = [Excursions(m.record.get("ranges") or {}) for m in models]
+    columns: Iterable[list[TrialLog]] = _followed(_read_each(files, models, read, told), excursions)
     whole = None
     if estimated_rows(files) * len(models) * BYTES > options.memory * 2**30:
         from greybox.report.comparison import MOST_LOGS
@@ -144,7 +165,7 @@ def run(options: argparse.Namespace) -> None:
     misnamed = (n for m in models for n in misnamed_columns(read, m.vessel))
     of = [run.log.provenance for run in comparison.runs[0]]
     own = (_own_logs(name, model, [p.sha256 for p in of]) for name, model in named.items())
-    notes = dict.fromkeys(filter(None, (*own, *told, *misnamed)))
+    notes = dict.fromkeys(filter(None, (*own, *_beyond(names, excursions), *told, *misnamed)))
     comparison = replace(comparison, notes=tuple(notes))
     record = provenance(options) | {"logs": [f"{p.source} {p.sha256[:12]}" for p in of]}
 

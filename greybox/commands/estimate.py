@@ -84,8 +84,8 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--structure",
         metavar="NAME",
-        help="thesis, surge, linear, blanke, modulus, abkowitz; +TERM and -TERM change it; "
-        "chosen by default",
+        help="thesis, surge, linear, blanke, modulus, abkowitz; +TERM and -TERM change it, in "
+        "quotes where a TERM holds |; chosen by default",
     )
     group.add_argument(
         "--effort",
@@ -482,8 +482,12 @@ def run(options: argparse.Namespace) -> None:
     def page() -> Page:
         from greybox.report.estimation import estimation_page
         from greybox.selection.prediction import as_read
+        from greybox.trial.segments import as_segments
 
-        return estimation_page(estimate, as_read(logs, estimate), made, choice=choice, mass=mass)
+        kept = as_read(as_segments(validate), estimate) if validate else ()
+        return estimation_page(
+            estimate, as_read(logs, estimate), made, choice=choice, mass=mass, validate=kept
+        )
 
     steps = after_estimate(estimate, made)
     publish(options, model.to_dict(), "\n\n".join(summaries), page, steps, [options.out])

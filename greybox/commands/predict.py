@@ -100,7 +100,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="N",
         help="propeller speed of the approach in place of --speed, or NAME=N for each; by default "
-        "the highest in the logs that the model was estimated on",
+        "the highest in the logs that the model was estimated on, or less where it would leave "
+        "no room to steer",
     )
     approach.add_argument(
         "--course", type=float, default=0.0, metavar="DEG", help="heading of the approach [deg] (0)"

@@ -29,7 +29,12 @@ from greybox.selection.prediction import require_distinct, require_others
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.trial.segments import as_segments
-from greybox.trial.validity import other_conditions, pooled_conditions
+from greybox.trial.validity import (
+    extrapolation_note,
+    other_conditions,
+    pooled_conditions,
+    ranges,
+)
 from greybox.validation.fit import at_model_rate
 
 _log = logging.getLogger(__name__)
@@ -185,6 +190,12 @@ def diagnose(
         lines.append(find_waves(white.nu, white.errors, names, problem.sample_time))
     say("gain")
     notes = paced
+    if options.causes and (idle := ready.untried()):
+        notes.append(
+            f"{', '.join(idle)} {'were' if len(idle) > 1 else 'was'} asked for and not tried, "
+            f"since these logs cannot show it or the model has it: a wind, for one, must have been "
+            f"measured."
+        )
     if apart and not any(c.hypothesis.key in apart for c in found.causes):
         notes.append(
             f"{', '.join(apart)} would help, but positions, heading and velocities of these logs "
@@ -198,6 +209,10 @@ def diagnose(
     if model is not None:
         conditions = (*conditions, *other_conditions(model.conditions, case.logs))
     notes += [d.sentence for d in conditions]
+    if ready.validate:
+        seen = ranges(case.logs, ready.structure.states)
+        said = extrapolation_note(seen, ready.validate)
+        notes += [said] if said else []
     causes = causes_of(ready.findings, ready.causes, ready.tried)
     if causes:
         notes.append(

@@ -97,6 +97,11 @@ class Prepared:
             self._coefficients(model), model.d[:2], model.integrator, self._changes(model)
         )
 
+    def untried(self) -> list[str]:
+        """Return the causes of which these logs leave nothing to try; waves need no hypothesis."""
+        tried = {h.id for h in self.hypotheses} | {f.id for f in self.findings} | {"waves"}
+        return [name for name in self.causes if name not in tried]
+
     @staticmethod
     def _coefficients(model: ManoeuvringModel) -> dict[str, float]:
         return dict(zip(model.names, map(float, model.theta), strict=True))

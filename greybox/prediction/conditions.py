@@ -154,11 +154,11 @@ def check(kind: Kind, model: ManoeuvringModel, asked: Conditions) -> None:
         )
 
 
-def driven(helm: Helm, model: ManoeuvringModel, asked: Conditions) -> Helm:
+def driven(kind: Kind, helm: Helm, model: ManoeuvringModel, asked: Conditions) -> Helm:
     """Return the helm whose propeller speeds at throttle 1 are those asked for.
 
     By default they are the greatest of the logs that the model was estimated on, within the
-    limits.
+    limits, and so much less that a difference which steers keeps the limits too.
 
     Raises
     ------
@@ -171,6 +171,9 @@ def driven(helm: Helm, model: ManoeuvringModel, asked: Conditions) -> Helm:
     moved = [n for n, d in zip(helm.columns, helm.drive, strict=True) if d != 0]
     if not given:
         given = _usual(helm, model, moved)
+        if kind in ("turning", "zigzag") and helm.kind == "difference":
+            less = _room_to_steer(helm, given, speed_order(helm, asked))
+            given = {n: v * less for n, v in given.items()}
     if "" in given:
         common = given.pop("")
         ahead = {n: math.copysign(1.0, helm.drive[helm.columns.index(n)]) for n in moved}
@@ -211,6 +214,13 @@ def _usual(helm: Helm, model: ManoeuvringModel, moved: Sequence[str]) -> dict[st
             )
         throttle = min(throttle, most)
     return {n: throttle * float(helm.drive[helm.columns.index(n)]) for n in moved}
+
+
+def _room_to_steer(helm: Helm, given: Mapping[str, float], order: float) -> float:
+    """Return the share of the given speeds at which an order to either side keeps the limits."""
+    driven = replace(helm, drive=np.array([given.get(n, 0.0) for n in helm.columns]))
+    ordered = driven.commands(np.ones(2), np.array([order, -order]))
+    return float(min(1.0, helm.room(ordered).min()))
 
 
 def tasks(kind: Kind, helm: Helm, model: ManoeuvringModel, asked: Conditions) -> list[Task]:

@@ -112,6 +112,13 @@ class Helm:
             (commands < low.reshape(shape) - slack) | (commands > high.reshape(shape) + slack)
         )
 
+    def room(self, commands: Array) -> Array:
+        """Return what each command (nc, R) may be multiplied with before it leaves its limits."""
+        low, high = (b[:, None] for b in bounds(self.limits))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            towards = np.where(commands > 0, high / commands, low / commands)
+        return np.asarray(np.where(commands == 0, math.inf, towards))
+
 
 def bounds(limits: Sequence[Limits]) -> tuple[Array, Array]:
     """Return lower and upper limits (nc,), infinite where none is stated."""

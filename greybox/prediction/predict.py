@@ -45,7 +45,7 @@ from greybox.prediction.running import Push, sail
 from greybox.prediction.ship import WHERE_CURRENT, WHERE_WIND
 from greybox.prediction.showing import bundle_of, log_of
 from greybox.prediction.start import Start, steady_start, trial_start
-from greybox.prediction.steady import Steady, require_straight, straight_run
+from greybox.prediction.steady import Steady, eased, require_straight, straight_run
 from greybox.prediction.trial import (
     TrialCurrent,
     as_in_trial,
@@ -122,7 +122,8 @@ def predict_manoeuvre(
         Approach speed over ground [m/s]; the propeller speed that holds it is solved for.
     command : float or mapping of str to float, optional
         Propeller speeds of the approach instead, in the unit of the log. By default the
-        greatest of the logs that the model was estimated on.
+        greatest of the logs that the model was estimated on, or less where the manoeuvre could
+        not be steered within the limits otherwise.
     thrusters : sequence of str
         Columns that steer, instead of rudders or the azimuth thrusters aft.
     share : float, optional
@@ -198,7 +199,7 @@ def predict_manoeuvre(
     told_rates: list[str] = []
     elsewhere: tuple[ConditionDifference, ...] = ()
     if trial is None:
-        helm = driven(helm, model, asked)
+        helm = driven(manoeuvre, helm, model, asked)
         todo = tasks(manoeuvre, helm, model, asked)
     else:
         logs = [trial] if isinstance(trial, TrialLog) else list(trial)
@@ -206,9 +207,11 @@ def predict_manoeuvre(
         found = found_in_trial(manoeuvre, logs, helm, asked)
         helm, told_rates = with_rates(helm, model.vessel.actuation, found)
         if asked.command:
-            helm = driven(helm, model, asked)
+            helm = driven(manoeuvre, helm, model, asked)
         todo = [task for task, _, _ in found]
     theta, d = _draws(model, asked)
+    if trial is None and asked.speed is None and not asked.command:
+        helm = eased(model, helm, theta, d, asked.course)
     flow = None
     if trial is not None and as_in_trial(asked):
         flow = _trial_current(model, helm, asked, logs, theta, d)

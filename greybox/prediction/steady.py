@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,11 @@ _SPEEDS = np.geomspace(1e-3, 100.0, _POINTS)
 # throttles tried where no limits are stated: in the unit of the log, whatever it is
 _THROTTLES = np.geomspace(1e-4, 1e6, _POINTS)
 _STEPS = 40
+# a step of Newton's method is halved until it leaves less over
+_HALVINGS = 30
 _TOLERANCE = 1e-13
+# times that the throttle is eased, and how far draws lower it below what the estimate needs
+_EASINGS, _LEAST_OF_OWN = 5, 0.9
 
 
 @dataclass(frozen=True)
@@ -99,31 +103,53 @@ def straight_run(
     unknown = np.zeros((size, len(theta)))
     unknown[0] = start
     steps = np.array([max(abs(start), 1e-3), scale, 0.1][:size])
-    error = np.full(len(theta), np.inf)
     with np.errstate(all="ignore"):
+        here = problem.residual(unknown)[:size]
         for _ in range(_STEPS):
-            here = problem.residual(unknown)[:size]
-            error = np.abs(here).max(axis=0)
-            if np.all((error < _TOLERANCE * scale) | ~np.isfinite(error)):
+            if np.all((_largest(here) < _TOLERANCE * scale) | ~np.isfinite(_largest(here))):
                 break
             slope = np.empty((len(theta), size, size))
             for j in range(size):
                 moved = unknown.copy()
                 moved[j] += 1e-6 * steps[j]
                 slope[:, :, j] = ((problem.residual(moved)[:size] - here) / (1e-6 * steps[j])).T
-            unknown = unknown - _solved(slope, here.T).T
+            unknown, here = _nearer(problem, unknown, here, _solved(slope, here.T).T)
+        error = _largest(here)
     x, throttle, trim = problem.unpack(unknown)
     commands = helm.commands(throttle, trim)
     ahead = x[states.index("u")]
     found = (error < 1e-6 * scale) & (ahead > 0) & ~helm.outside(commands).any(axis=0)
     if not found[0]:
         reach = "" if speed is None else f" at {speed:g} m/s"
+        if not error[0] < 1e-6 * scale:
+            raise InfeasibleError(
+                f"no commands balance the model's forces on a straight course{reach}, so there is "
+                f"no approach: give another --speed, or --command."
+            )
         raise InfeasibleError(
             f"the model finds no steady straight run{reach} within the commands' limits "
             f"(it needs {_named(helm, commands[:, 0])}): give another --speed, or --command."
         )
     way = np.hypot(ahead, x[states.index("v")] if "v" in states else 0.0)
     return Steady(x, throttle, trim, commands, way, found)
+
+
+def eased(model: ManoeuvringModel, helm: Helm, theta: Array, d: Array, heading: float) -> Helm:
+    """Return the helm with so much less throttle that the trim of the approach keeps the limits.
+
+    Two propellers that are not alike hold a course at two speeds, and the higher of them is
+    beyond its limit where the throttle is at its own. Parameters and errors are those of
+    `straight_run`.
+    """
+    driven = helm.drive != 0
+    for _ in range(_EASINGS):
+        steady = straight_run(model, helm.free(), theta, d, heading, None)
+        room = helm.room(steady.commands[:, steady.found])[driven].min(axis=0)
+        share = float(max(room.min(), _LEAST_OF_OWN * room[0]))
+        if share >= 1:
+            break
+        helm = replace(helm, drive=helm.drive * share * (1 - 1e-6))
+    return helm
 
 
 class _Problem:
@@ -138,7 +164,7 @@ class _Problem:
         heading: float,
         speed: float | None,
     ) -> None:
-        self.states = model.structure.states
+        self.states, self.length = model.structure.states, model.vessel.length
         self.helm, self.heading, self.speed = helm, heading, speed
         self.order = [self.states.index(n) for n in ("u", "v", "r") if n in self.states]
         self.ship = ShipDraws(
@@ -170,6 +196,31 @@ class _Problem:
         commands = self.helm.commands(throttle, trim)
         after = self.ship(self.ship.start(x, self.heading, commands), commands)
         return np.asarray((after[: len(x)] - x)[self.order])
+
+
+def _largest(residual: Array) -> Array:
+    return np.asarray(np.abs(residual).max(axis=0))
+
+
+def _nearer(problem: _Problem, unknown: Array, here: Array, step: Array) -> tuple[Array, Array]:
+    """Take Newton's steps, each halved until it leaves less over.
+
+    Damping that is quadratic alone has no slope at rest, so that a whole step goes anywhere.
+    Where rounding lets no step leave less, the last one is taken: it is next to nothing.
+    """
+    size = len(unknown)
+    # a yaw rate counts by the velocity that it makes at one ship length
+    weight = np.array([[1.0], [1.0], [problem.length]])[:size]
+    before = np.linalg.norm(weight * here, axis=0)
+    share = np.ones(unknown.shape[1])
+    for halving in range(_HALVINGS):
+        there = unknown - share * step
+        left = problem.residual(there)[:size]
+        longer = ~(np.linalg.norm(weight * left, axis=0) < before)
+        if halving == _HALVINGS - 1 or not longer.any():
+            break
+        share = np.where(longer, 0.5 * share, share)
+    return there, left
 
 
 def _solved(slope: Array, value: Array) -> Array:

@@ -60,6 +60,7 @@ def estimation_page(
     *,
     choice: StructureChoice | None = None,
     mass: float | None = None,
+    validate: Sequence[TrialLog] = (),
 ) -> Page:
     """Return the page, its story first.
 
@@ -74,8 +75,10 @@ def estimation_page(
         What other structures would have done.
     mass : float, optional
         m [kg], for physical coefficients.
+    validate : sequence of TrialLog
+        Those kept from the estimate that its prediction was judged on.
     """
-    lead, run = _run(estimate, logs)
+    lead, run = _run(estimate, logs, validate)
     sections = [
         run,
         _parameters(estimate),
@@ -156,18 +159,22 @@ def _summary(estimate: Estimate) -> list[str]:
     return told
 
 
-def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> tuple[Picture, Section]:
-    """Show the free run against the logs of the estimate, the worst of those drawn apart."""
+def _run(
+    estimate: Estimate, logs: Sequence[TrialLog], validate: Sequence[TrialLog]
+) -> tuple[Picture, Section]:
+    """Show the free run against the logs, the worst of those that judge drawn apart."""
     model = estimate.model()
-    drawn = logs[:_MOST_LOGS]
+    own, kept = logs[:_MOST_LOGS], validate[:_MOST_LOGS]
+    drawn = [*kept, *own]
     curves = 3 * len(drawn) * len(model.structure.states)
     runs = [run_model(model, log) for log in drawn]
-    worst = int(np.argmin([mean_fit(run.fit) for run in runs]))
+    worst = int(np.argmin([mean_fit(run.fit) for run in runs[: len(kept) or len(own)]]))
     pictures = []
     for i, (log, run) in enumerate(zip(drawn, runs, strict=True)):
+        whose = "kept from the estimate" if i < len(kept) else "the model was estimated on"
         caption = (
-            f"Free run on {log.name} ({len(log)} samples of {log.sample_time:g} s), a log the "
-            f"model was estimated on: measured, simulated, and their difference below."
+            f"Free run on {log.name} ({len(log)} samples of {log.sample_time:g} s), a log "
+            f"{whose}: measured, simulated, and their difference below."
         )
         told = f"Fit: {told_fits(run.fit, 0)}."
         picture = run_picture(["model"], [run], [], curves, f"run{i}", caption, told)
@@ -176,9 +183,16 @@ def _run(estimate: Estimate, logs: Sequence[TrialLog]) -> tuple[Picture, Section
     told = f"The model was fitted to {'these logs' if several else 'this log'}, so the free run "
     told += "shows what it cannot follow, not how well it predicts"
     sentences = [f"{told}: for that, see the table above." if estimate.prediction else f"{told}."]
-    if len(logs) > len(drawn):
-        sentences.append(f"Of {len(logs)} logs the first {len(drawn)} are drawn.")
+    if len(logs) > len(own):
+        sentences.append(f"Of {len(logs)} logs the first {len(own)} are drawn.")
+    if len(validate) > len(kept):
+        sentences.append(
+            f"Of {len(validate)} logs kept from the estimate the first {len(kept)} are drawn."
+        )
     first = "Of those drawn the one of lowest fit stands" if several else "Its free run is drawn"
+    if kept:
+        first = "Of the logs kept from the estimate the one of lowest fit stands"
+        first = first if len(kept) > 1 else "The log kept from the estimate stands"
     sentences.append(f"{first} at the top of the page.")
     lead = pictures.pop(worst)
     return lead, Section("1. Does its free run follow the log?", sentences, pictures)

@@ -296,7 +296,8 @@ def after_prediction(
         steps.append(
             NextStep(
                 f"State {' and '.join(rates)} in the vessel file, estimate again, and predict with "
-                f"that model: orders of {', '.join(made.instant)} act at once in this one"
+                f"that model: orders of {', '.join(made.instant)} act at once in this one (where "
+                f"they do on board, state a high rate)"
             )
         )
     speeds = [q.value for m in made.manoeuvres if (q := m.quantities["approach_speed"])]

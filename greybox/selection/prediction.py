@@ -32,6 +32,7 @@ from greybox.selection.request import Request
 from greybox.trial.kinematics import decimate_segments
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import as_segments
+from greybox.trial.validity import extrapolation_note
 from greybox.validation.calibration import calibrate_bands, run_errors
 from greybox.validation.held_commands import held_commands_diverge
 from greybox.validation.judge_prediction import HeldOut, judge_prediction
@@ -96,7 +97,9 @@ def with_prediction(
         others = as_read(as_segments(request.validate), estimate)
         runs = [HeldOut.of(model, log) for log in others]
         verdict = judge_prediction(runs, JudgedOn.VALIDATION, found=told, seed=request.seed)
-        return replace(estimate, prediction=verdict)
+        said = extrapolation_note(estimate.data.ranges, request.validate)
+        notes = dict.fromkeys([*estimate.notes, *([said] if said else [])])
+        return replace(estimate, prediction=verdict, notes=tuple(notes))
     if not held:
         runs = [HeldOut.of(model, log) for log in logs]
         told.append(NothingHeldOut(failed[0]))

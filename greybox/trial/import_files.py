@@ -32,6 +32,7 @@ from greybox.vessel.vessel import Vessel
 
 # recordings of one trial are not so far apart [s]
 _ANOTHER_TRIAL = 3600.0
+_NOTE = "note: "
 
 
 def raw_files(paths: Sequence[str]) -> list[str]:
@@ -126,8 +127,21 @@ def import_files(
                 lines = [f"mended: {n}" for n in fixed] + [f"left as it is: {n}" for n in left]
                 summaries.append(_write(mended, vessel, target, options, extra, lines))
         progress(len(logs), len(logs))
+    summaries = _shared_once(summaries)
     summaries += [f"note: {doubt}" for doubt in vessel.doubts]
     return "\n".join(summaries)
+
+
+def _shared_once(summaries: Sequence[str]) -> list[str]:
+    """Return summaries of several logs, of which the notes that all have are told once."""
+    lines = [s.splitlines() for s in summaries]
+    shared = [
+        x for x in dict.fromkeys(lines[0]) if x.startswith(_NOTE) and all(x in y for y in lines)
+    ]
+    if len(lines) < 2 or not shared:
+        return list(summaries)
+    own = ["\n".join(x for x in each if x not in shared) for each in lines]
+    return [*own, *(f"{_NOTE}all files: {x.removeprefix(_NOTE)}" for x in shared)]
 
 
 def is_folder(paths: Sequence[str | Path], out: str | Path) -> bool:

@@ -64,7 +64,11 @@ class Contents(DisplayMixin):
                 f"{name} {100 * s / self.seconds:.0f} %"
                 for name, s in sorted(self.regimes.items(), key=lambda item: -item[1])
             )
-            parts.append(f"sign regimes kept for {_SHORTEST:g} s or more: {said}")
+            rest = 100 * (1 - sum(self.regimes.values()) / self.seconds)
+            mixed = f"; for {rest:.0f} % u or v is near zero or changes sign sooner"
+            parts.append(
+                f"sign regimes kept for {_SHORTEST:g} s or more: {said}{mixed if rest > 50 else ''}"
+            )
         return "\n".join(parts)
 
     def _line(self) -> str:

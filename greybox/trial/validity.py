@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.channels import MOTION_WORDS
 from greybox.trial.log import TrialLog
 from greybox.trial.raw_log import shortened
 from greybox.vessel.conditions import UNITS, Conditions, Value, spelled, words
@@ -35,6 +36,9 @@ _SEA = 2
 _MOST_NAMED = 3
 # share of the samples left out at either end of a range: single ones are outliers
 _TAIL = 1e-3
+# share of a range by which a log may be outside it, as logs of one kind of trial are; share of its
+# samples that is told; signals are named by their samples outside, as a share of the most of any
+_SLACK, _OFTEN, _PART = 0.25, 0.05, 0.1
 # settings that stand for all of a log
 _SETTINGS = 16
 
@@ -226,6 +230,74 @@ def ranges(logs: Sequence[TrialLog], states: Sequence[str]) -> dict[str, tuple[f
             before = found.get(name, (low, high))
             found[name] = min(low, before[0]), max(high, before[1])
     return found
+
+
+class Excursions:
+    """For how long logs, one after another, leave the ranges of those of a model.
+
+    Parameters
+    ----------
+    known : mapping of str to (float, float)
+        `ranges` of the logs that the model was estimated on.
+    """
+
+    def __init__(self, known: Mapping[str, tuple[float, float]]) -> None:
+        self.known = known
+        self._names: list[str] = []
+        self._samples = self._left = 0
+        self._beyond: dict[str, int] = {}
+        self._seen: dict[str, tuple[float, float]] = {}
+        self._angles: set[str] = set()
+
+    def add(self, log: TrialLog) -> None:
+        """Take a log into account."""
+        outside = {n: _outside(log[n], *span) for n, span in self.known.items() if n in log}
+        self._names.append(log.name)
+        self._samples += len(log)
+        self._left += int(np.any([*outside.values(), np.zeros(len(log), bool)], axis=0).sum())
+        self._angles |= log.vessel.angle_commands
+        for name, (low, high) in ranges([log], tuple(outside)).items():
+            if name in outside:
+                before = self._seen.get(name, (low, high))
+                self._seen[name] = min(low, before[0]), max(high, before[1])
+                self._beyond[name] = self._beyond.get(name, 0) + int(outside[name].sum())
+
+    @property
+    def sentence(self) -> str:
+        """Signals and ranges, ``""`` where the logs hardly leave them."""
+        if self._left < max(_OFTEN * self._samples, 1):
+            return ""
+        most = max(self._beyond.values())
+        said = ", ".join(
+            self._spans(n) for n, count in self._beyond.items() if count >= _PART * most
+        )
+        leave = "leaves" if len(self._names) == 1 else "leave"
+        return (
+            f"{shortened(self._names, _MOST_NAMED)} {leave} what the model was estimated on for "
+            f"{100 * self._left / self._samples:.0f} % of the time: {said}. Errors there are those "
+            f"of extrapolation: to predict so far, estimate with a log that goes there too."
+        )
+
+    def _spans(self, name: str) -> str:
+        factor, unit = 1.0, {"u": " m/s", "v": " m/s"}.get(name, "")
+        if name == "r" or name in self._angles:
+            factor, unit = 180 / np.pi, " deg/s" if name == "r" else " deg"
+        a, b, low, high = (factor * x for x in (*self._seen[name], *self.known[name]))
+        said = MOTION_WORDS.get(name, name)
+        return f"{said} {a:z.3g} to {b:z.3g}{unit} (estimated on {low:z.3g} to {high:z.3g})"
+
+
+def extrapolation_note(known: Mapping[str, tuple[float, float]], logs: Sequence[TrialLog]) -> str:
+    """Return what `Excursions` say of logs, such as those held out."""
+    found = Excursions(known)
+    for log in logs:
+        found.add(log)
+    return found.sentence
+
+
+def _outside(value: Array, low: float, high: float) -> NDArray[np.bool_]:
+    slack = max(_SLACK * (high - low), 0.01 * max(abs(low), abs(high)))
+    return np.asarray((value < low - slack) | (value > high + slack))
 
 
 def settings_of(logs: Sequence[TrialLog]) -> dict[str, list[float]]:

@@ -203,6 +203,8 @@ _TABLES: dict[str, type[Table]] = {
 }
 _THRUSTERS: dict[str, type[Table]] = dict(zip(THRUSTER_TYPES, get_args(AnyThruster), strict=True))
 _COLUMNS = {"speed": "its propeller speed", "angle": "its angle", "rudder": "its rudder angle"}
+# how keys begin whose numbers are angles or yaw rates
+_IN_RADIANS = ("angle", "rudder_", "heading_", "r_std")
 _LACKS = {"angle": "has no angle of its own", "rudder": "cannot have a rudder"}
 _CHOICES = {"type": THRUSTER_TYPES, "drive": get_args(Drive), "law": ("linear", "quadratic")}
 _LIMITS = "{name} must be [lowest, highest], it is {value}: correct it."
@@ -342,7 +344,7 @@ def _sentence(error: ValidationError, source: str) -> str:
 
 def _in_radians(place: _Place, value: Any) -> str:
     """Return what is said of an angle that is written with its unit, "" of anything else."""
-    if not isinstance(value, str) or not place.key.startswith(("angle_", "rudder_")):
+    if not isinstance(value, str) or not place.key.startswith(_IN_RADIANS):
         return ""
     written = re.fullmatch(r"\s*([-+]?[\d.]+)\s*(?:deg|degrees?|°)\s*(/\s*s)?\s*", value)
     if written is None:

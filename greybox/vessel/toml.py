@@ -203,6 +203,12 @@ def _thruster(table: AnyThruster, where: str) -> Thruster:
         moved |= {key: command, f"{key}_other": column} if led else {
             key: column, f"{key}_other": command,
         }  # fmt: skip
+    fixed = moved.get("angle")
+    if isinstance(fixed, int | float) and abs(fixed) > 2 * math.pi:
+        raise VesselError(
+            f"angle of {where} is {fixed:g} rad, more than a turn: write radians, "
+            f"{math.radians(fixed):.4g} for {fixed:g} deg."
+        )
     limits: dict[str, Any] = {f"{k}_limits": _limits(row, k, where) for k in _MOVED}
     return Thruster(
         **moved,

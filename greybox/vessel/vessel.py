@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import floor, inf, isfinite, radians
+from itertools import combinations
+from math import degrees, floor, inf, isfinite, radians
 from typing import Any, Literal, get_args
 
 from greybox.channels import CHANNELS
@@ -159,6 +160,8 @@ class Thruster:
 
 # angles that turn faster [rad/s] are seldom meant
 _QUICK = 1.0
+# noise of a compass [rad] or gyro [rad/s] that is seldom meant
+_NOISY = 0.1
 # what follows slowly, beside one column by its name
 LagOn = Literal["force", "speed", "angle", "command"]
 DelayOn = Literal["speed", "angle", "command"]
@@ -421,6 +424,21 @@ class Vessel(DisplayMixin):
                         f"servos of small models reach: write radians, "
                         f"{radians(limits.rate):.4g} if {limits.rate:g} deg/s is meant."
                     )
+        for i, j in combinations(range(len(self.thrusters)), 2):
+            a, b = self.thrusters[i], self.thrusters[j]
+            apart = not set(a.columns) & set(b.columns)
+            if apart and a.type == b.type and (a.x, a.y) == (b.x, b.y) and a.y != 0:
+                said.append(
+                    f"thrusters {i + 1} and {j + 1} stand at one place, x = {a.x:g} m and "
+                    f"y = {a.y:g} m: sign of y? Starboard is positive."
+                )
+        for key, unit in (("heading_std", ""), ("r_std", "/s")):
+            value = self.sensors.get(key)
+            if value is not None and value > _NOISY:
+                said.append(
+                    f"{key} is {value:g} rad{unit}, which is {degrees(value):.3g} deg{unit}: "
+                    f"write radians, {radians(value):.4g} if {value:g} deg{unit} is meant."
+                )
         return tuple(said)
 
     @property

@@ -565,3 +565,23 @@ def test_windows_that_cannot_be(tmp_path, capsys, monkeypatch, cells, given, wor
     assert words in err
     assert err.count("\n") == 1
     assert os.listdir(tmp_path) == ["raw.csv"]
+
+
+def test_notes_that_all_files_share_are_told_once(tmp_path, capsys):
+    ship = tmp_path / "ship.toml"
+    ship.write_text('name = "S"\nlength = 2\n[[thruster]]\ntype = "fixed"\nspeed = "n"\n')
+    rows = "".join(f"{0.2 * k:.1f};{k};{5 + k}\n" for k in range(40))
+    for name, more in (("a", ""), ("b", ";Volt"), ("c", "")):
+        filled = rows.replace("\n", ";12\n") if more else rows
+        (tmp_path / f"{name}.csv").write_text(f"t;Heading [deg];n{more}\n{filled}")
+    files = [str(tmp_path / f"{n}.csv") for n in "abc"]
+    assert main(["import", *files, "--vessel", str(ship), "--out", str(tmp_path / "logs")]) == 0
+    told = capsys.readouterr().out
+    assert told.count("Heading [deg] taken for psi in deg") == 1
+    assert "note: all files: Heading [deg] taken for psi in deg" in told
+    # what one file alone has stays with it
+    assert (
+        told.index("b.csv: ") < told.index("note: columns not used: Volt") < told.index("c.csv: ")
+    )
+    assert main(["import", files[0], "--vessel", str(ship), "--out", str(tmp_path / "l.csv")]) == 0
+    assert "note: Heading [deg] taken for psi in deg" in capsys.readouterr().out

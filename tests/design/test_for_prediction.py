@@ -18,6 +18,7 @@ from experiment_design.excitation.rollout import Rollout
 from experiment_design.feasibility.constraint_satisfaction import ConstraintSatisfaction
 from experiment_design.for_causes import AskedCauses, open_causes
 from experiment_design.for_prediction import (
+    _crossed,
     _vague_note,
     command_ranges,
     design_for_prediction,
@@ -673,3 +674,10 @@ def test_a_start_short_of_its_margins_is_led_in(model) -> None:
     assert found.design.motions[0].state[0, :, 0].min() >= 0.2 - 1e-3
     with pytest.raises(InfeasibleError, match="lead-in"):
         design_for_prediction(replace(request, hold=150.0, duration=300.0), model, kept_starts=1)
+
+
+def test_a_sway_that_hardly_leaves_its_noise_is_not_cut_out() -> None:
+    few, most = _crossed([(1.0, 3.0), (50.0, 53.0)], 100.0), _crossed([(0.0, 98.0)], 100.0)
+    assert "from zero 2 times, 5 % of the trial: --margin-v of greybox estimate cuts" in few
+    assert "for 98 % of the trial, so it tells little of sway" in most
+    assert "once, 20 % of the trial" in _crossed([(10.0, 30.0)], 100.0)

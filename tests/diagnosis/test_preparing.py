@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from greybox.diagnosis.diagnose import diagnose
+from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.null_model import clocks_of
 from greybox.diagnosis.preparing import _movement, prepare
@@ -36,6 +36,18 @@ def test_the_order_of_the_logs_leaves_no_propeller_out() -> None:
         ship = Ship(np.zeros(0), np.zeros(2), trial.estimation.vessel)
         alike.append(share.apply(ship, np.ones(1)).vessel)
     assert alike[0] == alike[1]
+
+
+def test_causes_that_the_logs_cannot_show_are_told() -> None:
+    trial = draw(np.random.default_rng([31, 8]), (), samples=400, positions=False)
+    still = {n: v for n, v in trial.estimation.channels.items() if n not in ("u_q", "v_q")}
+    log = replace(trial.estimation, channels=still)
+    asked = ["wind", "current", "waves"]
+    assert prepare([log], [], None, "thesis", asked).untried() == ["wind"]
+    found = diagnose([log], options=DiagnosisOptions(causes=["wind"], own_pace=False))
+    assert found.verdict in ("none", "unexplained")
+    (note,) = [n for n in found.notes if "asked for" in n]
+    assert note.startswith("wind was asked for and not tried, since these logs cannot show it")
 
 
 def test_changes_count_from_the_start_of_a_log_that_has_gaps() -> None:

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from manoeuvring import LENGTH, linear_ship, rudder_model
+from manoeuvring import LENGTH, linear_ship, model_of, rudder_model
 
 from greybox.errors import InfeasibleError, UsageError
+from greybox.model.catalogue import get_structure
 from greybox.prediction.helm import find_helm
 from greybox.prediction.predict import predict_manoeuvre
 from greybox.prediction.steady import straight_run
@@ -96,6 +97,64 @@ def test_a_lopsided_ship_is_trimmed():
     assert math.hypot(u, v) == pytest.approx(3.0)
     told = predict_manoeuvre(model, "turning", side="port", speed=3.0, draws=40).summary()
     assert f"a steering order of {math.degrees(-delta):.3g} deg to port" in told
+
+
+def twin_screws(**extra):
+    """A catamaran of quadratic damping in sway alone, whose limits allow 100 percent."""
+    limits = {"speed_limits": [-80.0, 100.0]}
+    made = vessel(
+        *({"type": "fixed", "x": -8.0, "y": y, "speed": n, **limits}
+          for n, y in (("left", -4.0), ("right", 4.0)))
+    )  # fmt: skip
+    values = {"Xu": -0.2, "Xmu": 0.005, "Nr": -0.4, "Nmu": 0.0003, **extra}
+    structure = get_structure("linear").with_terms("Yvv", *(n for n in extra if n != "Yvv"))
+    return replace(
+        model_of(structure, {"Yvv": -2.0, **values}, made, spread=0.01),
+        record={"ranges": {"left": (-20.0, 100.0), "right": (-20.0, 100.0)}},
+    )
+
+
+def test_sway_that_is_damped_by_its_square_alone_is_trimmed():
+    """Yvv v|v| + Y_taux taux = 0: at rest the damping has no slope to start from."""
+    model = twin_screws(Y_taux=1e-4)
+    theta = np.vstack([model.theta, model.theta])
+    theta[1, model.names.index("Y_taux")] *= -4
+    made = straight_run(model, find_helm(model.vessel), theta, np.zeros((2, 4)), 0.0, 3.0)
+    assert made.found.all()
+    taux = made.commands.sum(axis=0)
+    for k, sign in ((0, 1), (1, -1)):
+        force = abs(theta[k, model.names.index("Y_taux")]) * taux[k]
+        damping = -theta[k, model.names.index("Yvv")]
+        assert made.x[1, k] == pytest.approx(sign * math.sqrt(force / damping), rel=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["zigzag", "turning", "stopping", "crash"])
+def test_the_usual_approach_leaves_room_for_trim_and_steering(kind):
+    """Logs with both propellers at their limit: neither more to steer nor to trim is left."""
+    model = twin_screws(N_0=0.004)
+    made = predict_manoeuvre(model, kind, draws=40)
+    speeds = [made.manoeuvres[0].log[n] for n in ("left", "right")]
+    assert max(s.max() for s in speeds) <= 100 * (1 + 1e-9)
+    before = [s[0] for s in speeds]
+    assert abs(before[0] - before[1]) > 1
+    assert max(before) == pytest.approx(100 if kind in ("stopping", "crash") else 68, rel=0.02)
+    assert "were left out" not in made.summary()
+
+
+def test_an_approach_that_is_asked_for_is_not_eased():
+    model = twin_screws(N_0=0.004)
+    with pytest.raises(InfeasibleError, match="within the commands' limits"):
+        predict_manoeuvre(model, "stopping", command=100.0, draws=40)
+    with pytest.raises(UsageError, match=r"this needs left = 1[0-9.]+, .* a lower --speed"):
+        predict_manoeuvre(model, "turning", command=90.0, draws=40)
+
+
+def test_forces_that_nothing_balances():
+    model = twin_screws(Y_taux=1e-4)
+    theta = model.theta.copy()
+    theta[model.names.index("Yvv")] = 0.0
+    with pytest.raises(InfeasibleError, match=r"no commands balance .* at 3 m/s"):
+        straight_run(model, find_helm(model.vessel), theta[None], np.zeros((1, 4)), 0.0, 3.0)
 
 
 def test_a_speed_out_of_reach_names_the_range():

@@ -142,6 +142,7 @@ def test_orders_are_not_said_to_act_at_once_where_the_model_delays_them(actuatio
     assert ("orders are taken to act at once" in headline(made)) == instant
     first = after_prediction(made, {}, "ship.toml")[0].line()
     assert first.startswith("next: state rudder_rate in the vessel file, estimate ag") == instant
+    assert first.endswith("(where they do on board, state a high rate)") == instant
 
 
 @pytest.mark.parametrize("kind", ["turning", "zigzag", "crash"])

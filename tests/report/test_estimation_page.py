@@ -134,6 +134,24 @@ def test_the_free_run_is_told_of_as_many_logs_as_there_are(estimate, log, page):
     assert "fits the logs it was estimated on" in told.headline
 
 
+def test_a_log_kept_from_the_estimate_leads(estimate, log):
+    other = virtual_log(2, 200, name="kept")
+    page = estimation_page(estimate, [log], {}, validate=[other])
+    assert (
+        "Free run on kept (200 samples of 1 s), a log kept from the estimate" in page.lead.caption
+    )
+    assert page.sections[0].sentences[-1] == (
+        "The log kept from the estimate stands at the top of the page."
+    )
+    (own,) = page.sections[0].pictures
+    assert "a log the model was estimated on" in own.caption
+    four = estimation_page(estimate, [log], {}, validate=4 * [other])
+    assert four.sections[0].sentences[-2:] == [
+        "Of 4 logs kept from the estimate the first 3 are drawn.",
+        "Of the logs kept from the estimate the one of lowest fit stands at the top of the page.",
+    ]
+
+
 def test_what_comes_next_of_a_model_of_surge_is_what_it_can_do():
     found = estimate_ls(
         build_predictor(get_structure("surge"), "basic", (("u", (1,)),)), [surge_log(1, 0.5, 300)]

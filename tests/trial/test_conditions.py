@@ -22,7 +22,12 @@ from greybox.trial.import_files import import_files
 from greybox.trial.kinematics import decimate
 from greybox.trial.log import make_log
 from greybox.trial.store import write_log
-from greybox.trial.validity import other_conditions, pooled_conditions, settings_of
+from greybox.trial.validity import (
+    extrapolation_note,
+    other_conditions,
+    pooled_conditions,
+    settings_of,
+)
 from greybox.validation.comparison import compare
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.toml import load_vessel, vessel_from_dict, vessel_to_dict
@@ -284,3 +289,37 @@ def test_settings_stood_together_in_a_log_and_reach_its_ends():
     assert (np.ptp(settings, axis=0) > 0.8 * spread)[spread > 0].all()
     model = estimate_model(logs, method="ls", structure="thesis").model()
     assert model.record["settings"] == found
+
+
+def with_channels(log, **channels):
+    return replace(log, channels={**log.channels, **channels})
+
+
+def test_logs_that_go_beyond_those_of_a_model():
+    known = {"u": (1.0, 1.2), "r": (0.0, 0.0), "n": (1.0, 1.0), "w": (0.0, 1.0)}
+    log = some_log("far")
+    assert not extrapolation_note(known, [log])
+    # half of its samples turn, a few of which surge ahead as well
+    turning = 0.1 * (np.arange(20) >= 10)
+    far = with_channels(log, r=turning, u=log["u"] + 0.4 * (np.arange(20) >= 16))
+    said = extrapolation_note(known, [far])
+    assert said.startswith("far leaves what the model was estimated on for 50 % of the time: surge")
+    assert "yaw rate 0 to 5.73 deg/s (estimated on 0 to 0)" in said
+    assert " n " not in said
+    both = extrapolation_note(known, [log, far])
+    assert both.startswith("far, far leave what")
+    assert "for 25 % of the time" in both
+    # single samples are outliers
+    spiky = with_channels(log, u=np.where(np.arange(20) == 4, 9.0, 1.1))
+    assert not extrapolation_note(known, [log, spiky])
+
+
+def test_held_out_logs_beyond_those_of_the_estimate_are_told(logs, estimate):
+    slow, fast = logs[0], with_channels(logs[1], u=logs[1]["u"] + 1.0)
+    beyond = "leaves what the model was estimated on"
+    for judge, told in ((logs[1], False), (fast, True)):
+        found = estimate_model([slow], validate=[judge], method="ls", structure="thesis")
+        assert any(beyond in n for n in found.notes) == told
+        options = DiagnosisOptions(causes=["current"])
+        made = diagnose([slow], model=estimate.model(), validate=[judge], options=options)
+        assert any(beyond in n for n in made.notes) == told

@@ -358,6 +358,30 @@ def test_coarse_positions_that_repeat_by_rounding_are_not_held():
     assert not hold_findings(as_recording({"t": d["t"], **coarse}))
 
 
+@pytest.mark.parametrize("decimals", [7, 8])
+def test_rounded_latitudes_and_longitudes_repeat_by_chance(decimals, ship):
+    """A slow ship whose RTK noise exceeds her way per sample: 7 decimals are steps of 1 cm."""
+    rng = np.random.default_rng(8)
+    t = np.arange(0, 1200, 0.2)
+    north, east = 60 * np.sin(t / 100), 60 * np.cos(t / 130)
+    noise = 1.8e-7 * rng.standard_normal((2, len(t)))
+    lat = np.round(54.0 + north / 111.3e3 + noise[0], decimals)
+    lon = np.round(10.0 + east / 65.2e3 + 1.7 * noise[1], decimals)
+    repeats = (np.diff(lat) == 0) & (np.diff(lon) == 0)
+    assert repeats.any() == (decimals == 7)
+
+    def findings():
+        log = Recording("geo", (Signal("lat", t, lat), Signal("lon", t, lon)))
+        return [f for f in check_recording(log, ship).findings if f.id == "position_hold"]
+
+    assert not findings()
+    late = [1200, 1201, 2300, 2301, 2302]
+    for k in late:
+        lat[k], lon[k] = lat[k - 1], lon[k - 1]
+    (found,) = findings()
+    assert set(late) <= set(between(t, found))
+
+
 def test_a_moored_ship_may_repeat_its_position():
     rng = np.random.default_rng(2)
     t = np.arange(0, 300, 0.2)

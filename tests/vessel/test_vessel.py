@@ -315,6 +315,34 @@ def test_a_rudder_ahead_of_the_origin_is_asked_about():
     assert not vessel({**AZIMUTH, "x": 14.0}).doubts
 
 
+def test_two_thrusters_at_one_place_are_asked_about():
+    port = {"type": "fixed", "x": -0.85, "y": -0.41, "speed": "left"}
+    (doubt,) = vessel(port, {**port, "speed": "right"}).doubts
+    assert "thrusters 1 and 2 stand at one place, x = -0.85 m and y = -0.41 m: sign of y?" in doubt
+    assert not vessel(port, {**port, "y": 0.41, "speed": "right"}).doubts
+    # in line, as contrarotating propellers are; and two of one column
+    assert not vessel({**port, "y": 0.0}, {**port, "y": 0.0, "speed": "right"}).doubts
+    assert not vessel(port, port).doubts
+
+
+def test_noise_in_degrees_is_asked_about():
+    made = {"name": "model", "length": 2.0, "thruster": [RUDDER]}
+    first, second = vessel_from_dict({**made, "sensors": {"heading_std": 0.3, "r_std": 0.2}}).doubts
+    assert "heading_std is 0.3 rad, which is 17.2 deg: write radians, 0.005236" in first
+    assert "0.003491 if 0.2 deg/s is meant" in second
+    assert not vessel_from_dict({**made, "sensors": {"heading_std": 0.01, "r_std": 0.004}}).doubts
+    with pytest.raises(VesselError, match=r"heading_std in .* '0.3 deg', .* 0.005236 for 0.3 deg"):
+        vessel_from_dict({**made, "sensors": {"heading_std": "0.3 deg"}})
+
+
+def test_an_angle_of_a_fixed_thruster_is_in_radians():
+    fixed = {"type": "fixed", "x": -0.85, "speed": "n"}
+    with pytest.raises(VesselError, match=r"angle of thruster 1 is 180 rad, .* 3\.142 for 180 deg"):
+        vessel({**fixed, "angle": 180})
+    with pytest.raises(VesselError, match=r"in radians: 3\.142 for 180 deg"):
+        vessel({**fixed, "angle": "180 deg"})
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -27,6 +27,8 @@ _UNDER_WAY = 5.0
 _AROUND, _AROUND_SAMPLES = 2.0, 5
 # steps of a rounded position that a hold must miss
 _MISSED = 3.5
+# greatest way that the bend of a geographic grid adds where a coordinate repeats [m]
+_BEND = 1e-4
 # chance that as many held samples come of rounding alone
 _CHANCE = 0.01
 # share of held messages from which on holding at even intervals is a receiver's own rate
@@ -75,18 +77,22 @@ def _grid(value: Array) -> float:
     if digits:
         # the coarsest step, that of the largest values
         return float(10.0 ** (np.floor(np.log10(np.abs(value).max())) + 1 - digits))
-    way = np.abs(np.diff(value[:20000]))
-    way = way[way > 1e-6]
+    every = np.abs(np.diff(value[:20000]))
+    way = every[every > _BEND]
     if len(way) < 10:
         return 0.0
-    least = float(np.quantile(way, 0.01))
-    step = float(np.mean(way[way < 1.5 * least]))
-    multiple = np.abs(np.diff(value[:20000])) / step
-    whole = np.round(multiple)
-    # at a steady speed all ways are alike: a grid shows in ways of several steps
-    usual = np.mean(whole == np.median(whole))
-    near = np.mean(np.abs(multiple - whole) < 0.15)
-    return step if near > 0.9 and usual < 0.98 else 0.0
+    # where single steps are rare, a larger share of the ways begins at two of them
+    for share in (0.01, 0.002):
+        least = float(np.quantile(way, share))
+        step = float(np.mean(way[way < 1.5 * least]))
+        multiple = every / step
+        whole = np.round(multiple)
+        # at a steady speed all ways are alike: a grid shows in ways of several steps
+        usual = np.mean(whole == np.median(whole))
+        near = np.mean(np.abs(multiple - whole) < 0.15)
+        if near > 0.9 and usual < 0.98:
+            return step
+    return 0.0
 
 
 def hold_findings(recording: Recording) -> list[Finding]:
