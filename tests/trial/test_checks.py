@@ -13,10 +13,11 @@ from virtual import as_recording, recorded
 
 from greybox.errors import LogError, UsageError
 from greybox.trial.checks.check import check_files, check_recording, misnamed_columns
-from greybox.trial.checks.course import course_findings, track_findings
+from greybox.trial.checks.course import course_findings
 from greybox.trial.checks.finding import IDS, exact_finding, factor_of
 from greybox.trial.checks.signal_quality import angle_unit_findings, still_rudder_findings
 from greybox.trial.checks.thruster_response import answer_findings
+from greybox.trial.checks.track import track_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.convert.derived_signals import derive_signals

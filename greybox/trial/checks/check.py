@@ -13,7 +13,7 @@ from greybox.files import real_path
 from greybox.numerics.parallel import map_forked
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.checks.actuators import measure_actuators
-from greybox.trial.checks.course import course_findings, make_course, track_findings
+from greybox.trial.checks.course import course_findings, make_course
 from greybox.trial.checks.external_force import force_findings
 from greybox.trial.checks.finding import IDS, CheckReport, Finding, Outcome
 from greybox.trial.checks.frame_sign_unit import (
@@ -38,6 +38,7 @@ from greybox.trial.checks.signal_quality import (
     time_format_findings,
 )
 from greybox.trial.checks.thruster_response import answer_findings
+from greybox.trial.checks.track import track_findings
 from greybox.trial.checks.wind_convention import wind_findings
 from greybox.trial.convert.channel_mapping import read_recording
 from greybox.trial.convert.deduplicate import first_run
