@@ -141,6 +141,7 @@ def test_logs_beyond_the_memory_are_read_in_passes(folder, tmp_path, capsys):
     assert found["verdict"]["prediction"]["level"] in ("good", "limited", "poor")
 
 
+@pytest.mark.long
 def test_logs_beyond_the_memory_are_diagnosed_on_stretches(folder, tmp_path, monkeypatch):
     monkeypatch.setattr("greybox.selection.stretches._DRAWN", 800)
     model, out = tmp_path / "model.json", tmp_path / "d.json"
@@ -156,6 +157,7 @@ def test_logs_beyond_the_memory_are_diagnosed_on_stretches(folder, tmp_path, mon
     assert main([*asked, "--validate", str(folder / "day2.csv")]) == 1
 
 
+@pytest.mark.long
 def test_logs_beyond_the_memory_are_checked_in_groups(folder, tmp_path, capsys):
     found = []
     for name, memory in (("whole", 4), ("groups", 0.00045)):

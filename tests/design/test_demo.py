@@ -49,6 +49,7 @@ def test_unknown_effects_are_named_with_those_that_exist(tmp_path, capsys):
     assert "thruster_lag" in EFFECTS
 
 
+@pytest.mark.long
 def test_ctrl_c_in_a_search_ends_the_loop(tmp_path, monkeypatch):
     """A search that is stopped gives the best plan so far, on which the demo would go on."""
 

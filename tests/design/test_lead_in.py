@@ -128,8 +128,16 @@ def test_the_descent_has_the_exact_gradient() -> None:
     ("limits", "told"),
     [
         ({"speed_cap": 0.66}, "the speed cap of 0.66 m/s stops it. Use --speed-cap "),
-        ({"area": Circle(0.0, 0.0, 3.0)}, "the sea room stops it. Enlarge it by "),
-        ({"margins": {"u": 0.5, "v": 3.4}}, "the margin of sway of 3.4 m/s stops it, "),
+        pytest.param(
+            {"area": Circle(0.0, 0.0, 3.0)},
+            "the sea room stops it. Enlarge it by ",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            {"margins": {"u": 0.5, "v": 3.4}},
+            "the margin of sway of 3.4 m/s stops it, ",
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_a_refusal_names_the_limit_and_what_helps(limits, told) -> None:

@@ -40,6 +40,7 @@ def test_an_arm_of_the_positions_alone_is_proved() -> None:
         assert abs(arm.value[i] - trial.truth[0].parameters[name]) < 2 * half
 
 
+@pytest.mark.long
 def test_sensors_that_share_a_place_agree_and_forces_must_tell() -> None:
     trial = trial_of("antenna")
     ready = prepare([trial.estimation], [trial.validation], None, "thesis", None)

@@ -183,6 +183,7 @@ def test_what_the_log_shows_by_itself_has_no_gain() -> None:
     json.dumps(told, allow_nan=False)
 
 
+@pytest.mark.long
 def test_all_causes_count_as_tried_though_only_some_are_left() -> None:
     trial = draw(np.random.default_rng([31, 0]), ("quadratic_yaw_damping", "current"), samples=600)
     ready = prepare(

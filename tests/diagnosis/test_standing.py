@@ -326,6 +326,7 @@ def test_what_may_be_chance_is_told_as_no_help(sailed) -> None:
     assert ruled.leaning == (current,)
 
 
+@pytest.mark.long
 def test_beside_a_measured_wind_a_current_is_weighed_against_forces_of_the_air_too() -> None:
     trial = draw(np.random.default_rng([3, 4]), ("wind",), samples=400)
     ready = prepare([trial.estimation], [trial.validation], None, "thesis", ["wind", "current"])

@@ -48,6 +48,7 @@ def windy(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
     return prepared(tmp_path_factory.mktemp("windy"), blows=True)
 
 
+@pytest.mark.long
 def test_errors_tell_from_where_a_wind_blew_that_pushes_the_ship(
     windy: Prepared, tmp_path: Path
 ) -> None:

@@ -278,13 +278,11 @@ def test_a_cluster_computes_the_same_though_a_worker_is_killed(cluster, tmp_path
     assert issubclass(WorkerError, RuntimeError)
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.parametrize(
     "command",
-    [
-        "estimate",
-        *(pytest.param(c, marks=pytest.mark.long) for c in ("diagnose", "fleet", "reproduce")),
-    ],
+    ["estimate", "diagnose", "fleet", "reproduce"],
 )
 def test_commands_write_the_same_wherever_they_compute(
     cluster, tmp_path, command, monkeypatch, caplog

@@ -76,6 +76,7 @@ def test_logs_are_left_out_in_balanced_groups_and_a_single_log_in_parts():
         parts_of([log.window(0, 60)])
 
 
+@pytest.mark.long
 def test_an_estimate_to_be_trusted_is_compared_with_nothing(monkeypatch):
     def never(*_):
         raise AssertionError

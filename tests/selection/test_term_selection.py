@@ -221,6 +221,7 @@ def test_thrust_that_goes_with_the_square_of_the_speed_is_told(catamaran):
     assert sum(row["chosen"] for row in choice.rows) == 1
 
 
+@pytest.mark.long
 def test_a_path_that_ends_in_a_local_minimum_decides_nothing(catamaran, monkeypatch):
     logs = [log.window(0, 500, log.name) for part in catamaran[:2] for log in part]
     (few, most), _ = first_terms(force_inputs(logs[0].vessel))

@@ -133,7 +133,9 @@ def test_latency_is_found_to_a_tenth_of_a_second(channels, late, rate, ship):
     assert not again.findings
 
 
-@pytest.mark.parametrize("arm", [(1.0, 0.0), (-0.7, 0.8), (4.0, -2.0)])
+@pytest.mark.parametrize(
+    "arm", [(1.0, 0.0), (-0.7, 0.8), pytest.param((4.0, -2.0), marks=pytest.mark.long)]
+)
 def test_lever_arm(arm, ship):
     log = as_recording(recorded(70, 2.0, arm=arm))
     (found,) = check_recording(log, ship).findings

@@ -78,7 +78,7 @@ def overlap(finding, start):
     return min(high, start + LENGTH) - max(low, start)
 
 
-@pytest.mark.parametrize("fixed", [False, True])
+@pytest.mark.parametrize("fixed", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_a_push_is_found_where_it_acts_and_nowhere_else(fixed):
     for seed in range(1, 5):
         recording, start = sailed(seed, 0.5, fixed=fixed)

@@ -302,7 +302,7 @@ def test_a_manoeuvre_that_begins_on_a_jump_is_none():
 # positions that are held
 
 
-@pytest.mark.parametrize("rate", [1.0, 4.0])
+@pytest.mark.parametrize("rate", [1.0, pytest.param(4.0, marks=pytest.mark.long)])
 def test_held_positions_are_found_alone_and_mended(rate, ship, tmp_path):
     d = copied(31, rate)
     rows = [100, 230, 231, 400]

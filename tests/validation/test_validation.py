@@ -154,6 +154,7 @@ def test_sign_test_is_binomial():
     assert t.p_value == pytest.approx(2 / 16)
 
 
+@pytest.mark.long
 def test_the_theory_chooses_where_its_conditions_hold(noisy_log):
     found = estimate_model([noisy_log])
     e = found.meant
