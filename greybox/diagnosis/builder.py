@@ -29,9 +29,8 @@ from greybox.diagnosis.evidence.kinematics import denied
 from greybox.diagnosis.evidence.standing import standing
 from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.gain import gains, run_on, runs_on
 from greybox.diagnosis.hypothesis import Hypothesis
-from greybox.diagnosis.null_model import FOLDS, DiagnosisProblem
+from greybox.diagnosis.null_model import FOLDS, DiagnosisProblem, run_on, runs_on
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.quantities import quantities_of
 from greybox.diagnosis.residuals import residual_tests
@@ -39,7 +38,6 @@ from greybox.diagnosis.result import (
     BudgetPart,
     Diagnosis,
     Found,
-    Gain,
     Quantity,
     Ranked,
     Runs,
@@ -61,6 +59,7 @@ from greybox.trial.log import TrialLog
 from greybox.trial.validity import ranges, settings_of
 from greybox.validation.bands import LEVEL, Z, predict_bands
 from greybox.validation.fit import LogFit, fit_on
+from greybox.validation.gain import Gain, gains
 
 Array = NDArray[np.float64]
 

@@ -17,6 +17,7 @@ from greybox.notebook import DisplayMixin, interval, items, number, table, text,
 from greybox.trial.log import TrialLog
 from greybox.trial.validity import ConditionDifference
 from greybox.validation.fit import LEFT
+from greybox.validation.gain import Gain
 
 Array = NDArray[np.float64]
 
@@ -136,19 +137,6 @@ class Found:
             return "the log itself shows it, without a free run"
         which = "without" if self.held_out > 0 else "with"
         return f"the held-out free run leaves every bound {which} it"
-
-
-@dataclass(frozen=True)
-class Gain:
-    """Fit (6.12) of the free run before and after, with a 95 % interval of the difference [%]."""
-
-    before: float
-    after: float
-    ci: tuple[float, float]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the gain for JSON."""
-        return {"before": self.before, "after": self.after, "ci": list(self.ci)}
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.evidence.held_out import HeldOut, Pair, proof_of, worse
 from greybox.diagnosis.evidence.omnibus import Omnibus, disagreement, omnibus
 from greybox.diagnosis.point import Fit
-from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain, file_word
+from greybox.diagnosis.result import DiagnosisVerdict, Found, file_word
 from greybox.diagnosis.search import Candidate, Search, left_to_motion
 from greybox.diagnosis.ship import LogRun
 from greybox.diagnosis.symptoms import moved_beside, word
@@ -33,6 +33,7 @@ from greybox.diagnosis.thresholds import (
 )
 from greybox.diagnosis.waves import Waves, noise_in, squares_in
 from greybox.model.run.step import Integrator
+from greybox.validation.gain import Gain
 
 Array = NDArray[np.float64]
 
