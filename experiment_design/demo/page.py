@@ -16,12 +16,13 @@ from greybox.report.comparison import comparison_page
 from greybox.report.diagnosed_causes import cause_section
 from greybox.report.diagnosis import diagnosis_page, gain_picture, gain_section
 from greybox.report.error_budget import noise_bounds, noise_sentence, noise_shares
-from greybox.report.figures import to_svg, told_fits
+from greybox.report.figures import to_svg
 from greybox.report.log import page_figures
 from greybox.report.model_difference import marked_equations
 from greybox.report.next_steps import NextStep
 from greybox.report.page import Marked, Page, Picture, Section, Table, flatten
 from greybox.validation.comparison import Comparison
+from greybox.validation.fit import told_fits
 
 # share of the squared error from which on noise is all that is left
 _NOISE = 0.9
@@ -83,7 +84,7 @@ def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
         sentences=[
             "Each step below shows the command that does it; the files that it reads and writes "
             "stand beside this page, so that every step can be taken again by hand.",
-            *([noise_sentence(diagnosis)] if budget else []),
+            *([noise_sentence(noise_shares(diagnosis), noise_bounds(diagnosis))] if budget else []),
         ],
         lead=gain,
         next_steps=[

@@ -9,8 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from greybox.channels import CHANNELS, MOTION_WORDS
-from greybox.diagnosis.result import Diagnosis, Gain, Runs, hardly_split, is_split
-from greybox.estimation.prediction_verdict import LIMITS
+from greybox.diagnosis.result import Diagnosis, Runs, hardly_split, is_split
 from greybox.report.chart import chart_of
 from greybox.report.diagnosed_causes import cause_section, probability
 from greybox.report.diagnosis_figures import (
@@ -31,9 +30,10 @@ from greybox.report.error_budget import (
     largest,
     noise_bounds,
     noise_sentence,
+    noise_shares,
     tells,
 )
-from greybox.report.figures import narrow, percent, told_fits
+from greybox.report.figures import narrow
 from greybox.report.free_run_errors import REGIMES, Errors, gather, simulations
 from greybox.report.model_difference import (
     coefficient_table,
@@ -43,15 +43,14 @@ from greybox.report.model_difference import (
 from greybox.report.next_steps import NextStep
 from greybox.report.page import Page, Picture, Section, Table, capital, computed
 from greybox.report.thinning import points_for
+from greybox.validation.comparison_verdict import use_sentence
+from greybox.validation.fit import percent
+from greybox.validation.gain import Gain
 
 # logs of each kind that are drawn: with more the page grows and tells nothing new
 _MOST_LOGS = 3
 # characters of a verdict that leave room for the next step on the first screen
 _LONGEST = 330
-# fit [%] with which the error is half of the spread: the limit of a good prediction
-_USABLE = 100 * (1 - LIMITS.good)
-# percent of fit below what noise allows that are as good as it
-_NEAR = 5.0
 
 
 def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
@@ -117,16 +116,8 @@ def _use(diagnosis: Diagnosis) -> str:
     after = {s: g.after for s, g in diagnosis.gain.items()}
     if not after:
         return ""
-    bounds = {s: b for s, b in noise_bounds(diagnosis).items() if s in after}
-    # noise may hide a channel, which is no fault of the model
-    weak = [s for s, fit in after.items() if fit < min(_USABLE, bounds.get(s, 100.0) - _NEAR)]
     which = "the extended model" if _changed(diagnosis) else "the model"
-    words = ", ".join(MOTION_WORDS.get(s, s) for s in weak)
-    told = f"Do not predict {words} with {which}" if weak else f"You can predict with {which}"
-    told += f": on data held out from the fit it has a fit of {told_fits(after, 0)}"
-    if bounds:
-        told += f"; sensor noise allows at most {told_fits(bounds, 0)}"
-    return f"{told}."
+    return use_sentence(which, "data held out from the fit", after, noise_bounds(diagnosis))
 
 
 def _step(told: str) -> NextStep:
@@ -144,7 +135,7 @@ def _summary(diagnosis: Diagnosis) -> list[str]:
         )
         told.append(f"The fit of the free run (100 % is perfect) changes: {gains}.")
     if diagnosis.budget:
-        told.append(noise_sentence(diagnosis))
+        told.append(noise_sentence(noise_shares(diagnosis), noise_bounds(diagnosis)))
     return told
 
 

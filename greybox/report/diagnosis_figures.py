@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator, SymmetricalLogLocator
 from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS, MOTION_WORDS
-from greybox.diagnosis.result import Gain, Ranked, Runs
+from greybox.diagnosis.result import Ranked, Runs
 from greybox.report.error_profiles import Profile, profile
 from greybox.report.figures import (
     BLACK,
@@ -28,6 +28,7 @@ from greybox.report.figures import (
 from greybox.report.free_run_errors import REGIMES, Errors, simulated, simulations
 from greybox.report.thinning import find_gaps
 from greybox.validation.fit import LEFT
+from greybox.validation.gain import Gain
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

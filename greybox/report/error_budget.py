@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from textwrap import fill
 
@@ -18,10 +18,9 @@ from greybox.report.figures import (
     legend_outside,
     new_figure,
     tidy,
-    told_fits,
 )
 from greybox.report.page import Table
-from greybox.validation.fit import fit_percent
+from greybox.validation.fit import noise_fit, told_fits
 
 # inches: letters stay legible where the page is 390 px wide
 _WIDTH = 4.4
@@ -135,17 +134,17 @@ def noise_bounds(diagnosis: Diagnosis) -> dict[str, float]:
         if state not in held[0]:
             continue
         measured = np.concatenate([one[state] for one in held])
-        bounds[state] = max(float(fit_percent(measured, measured - float(std))), 0.0)
+        bounds[state] = noise_fit(measured, float(std))
     return bounds
 
 
-def noise_sentence(diagnosis: Diagnosis) -> str:
+def noise_sentence(
+    shares: Mapping[str, float], bounds: Mapping[str, float], of: str = " that is left"
+) -> str:
     """Return how much of the error that is left is noise, and the fit that noise alone allows."""
-    shares = {s: 100 * share for s, share in noise_shares(diagnosis).items()}
-    bounds = {s: b for s, b in noise_bounds(diagnosis).items() if s in shares}
-    said = (
-        f"Sensor noise makes up this much of the squared error that is left: {told_fits(shares, 0)}"
-    )
+    told = told_fits({s: 100 * share for s, share in shares.items()}, 0)
+    said = f"Sensor noise makes up this much of the squared error{of}: {told}"
+    bounds = {s: b for s, b in bounds.items() if s in shares}
     if bounds:
         said += (
             f". Measured with that noise, a perfect model would have a fit of about "

@@ -35,14 +35,14 @@ from greybox.report.estimation_figures import (
     tried_figure,
     visited_figure,
 )
-from greybox.report.figures import narrow, to_svg, told_fits
+from greybox.report.figures import narrow, to_svg
 from greybox.report.model_difference import shown_unit, unbroken
 from greybox.report.next_steps import after_estimate
 from greybox.report.page import Page, Picture, Section, Table, capital, computed
 from greybox.report.physical import physical_summary
 from greybox.selection.structures import StructureChoice
 from greybox.trial.log import TrialLog
-from greybox.validation.fit import mean_fit, run_model
+from greybox.validation.fit import mean_fit, run_model, told_fits
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,6 @@ from greybox.report.figures import (
     BLUE,
     VERMILION,
     new_figure,
-    percent,
     shorten,
     tidy,
     to_svg,
@@ -26,6 +25,7 @@ from greybox.report.figures import (
 from greybox.report.model_difference import shown_unit, unbroken
 from greybox.report.next_steps import after_fleet
 from greybox.report.page import Page, Picture, Section, Table, capital, computed
+from greybox.validation.fit import percent
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import CHANNELS
+from greybox.channels import CHANNELS, MOTION_WORDS
 from greybox.errors import LogError
 from greybox.model.model import ManoeuvringModel
 from greybox.model.run.changes import Change
@@ -77,6 +77,21 @@ def fit_on(log: TrialLog, states: Sequence[str], x: Array) -> dict[str, float]:
         percent = fit_percent(log[state][known], x[known, i]) if known.any() else np.nan
         fit[state] = float(percent)
     return fit
+
+
+def noise_fit(measured: Array, std: float) -> float:
+    """Return the fit (6.12) [%] of a perfect model, measured with noise of a deviation; 0 least."""
+    return max(float(fit_percent(measured, measured - std)), 0.0)
+
+
+def percent(fit: float, digits: int = 1) -> str:
+    """Return a fit (6.12) [%] in words."""
+    return f"{fit:.{digits}f} %" if fit > LEFT else "diverged"
+
+
+def told_fits(fit: Mapping[str, float], digits: int = 1) -> str:
+    """Return the fit of each state in words."""
+    return ", ".join(f"{MOTION_WORDS.get(s, s)} {percent(v, digits)}" for s, v in fit.items())
 
 
 _log = logging.getLogger(__name__)

@@ -11,16 +11,7 @@ import pytest
 from browser import needs_browser, require_legible, without_scripts
 from virtual import PARAMETERS, virtual_log
 
-from greybox.diagnosis.result import (
-    BudgetPart,
-    Diagnosis,
-    Found,
-    Gain,
-    Quantity,
-    Ranked,
-    Runs,
-    Symptom,
-)
+from greybox.diagnosis.result import BudgetPart, Diagnosis, Found, Quantity, Ranked, Runs, Symptom
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
@@ -40,6 +31,7 @@ from greybox.report.model_difference import (
 from greybox.report.page import render, write_page
 from greybox.study.chapter6 import TRUE
 from greybox.validation.fit import run_model
+from greybox.validation.gain import Gain
 from greybox.vessel.toml import load_vessel
 from greybox.vessel.vessel import Actuation
 

@@ -97,9 +97,12 @@ def test_a_comparison_tells_of_gaps_and_of_runs_that_left(clean_log, thesis, tru
     told = comparison_page(found, [model], {}).sentences
     assert [s for s in told if "a run begins anew after it" in s]
     (run,) = found.runs[0]
-    left = replace(found, runs=((replace(run, fit={"u": -2320.0, "v": -np.inf, "r": -261.4}),),))
+    fit = {"u": -2320.0, "v": -np.inf, "r": -261.4}
+    verdict = replace(found.verdict, fit=fit)
+    left = replace(found, runs=((replace(run, fit=fit),),), verdict=verdict)
     page = comparison_page(left, [model], {})
-    assert ": surge diverged, sway diverged, yaw rate -261 % (100" in page.headline
+    assert "Do not predict surge, sway, yaw rate with 'm'" in page.headline
+    assert "it has a fit of yaw rate -261 % and its run of surge, sway diverges" in page.headline
     assert page.tables[0].rows[0][2:5] == ["diverged", "diverged", "-261.4"]
     assert page.lead.alternative.endswith("m surge diverged, sway diverged, yaw rate -261.4 %.")
 
