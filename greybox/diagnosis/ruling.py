@@ -343,6 +343,11 @@ def _next(
             "--out estimated.json"
         )
     elif verdict in (DiagnosisVerdict.UNEXPLAINED, DiagnosisVerdict.PARTLY):
+        if verdict is DiagnosisVerdict.UNEXPLAINED:
+            out.append(
+                "see whether sensors and the vessel file are right: greybox check LOGS --vessel V "
+                "--report check.html"
+            )
         out.append(
             "measure what the model does not know (wind, depth, draught, propeller and rudder as "
             "they really moved), repeat a run of these logs, and diagnose both together"
@@ -354,5 +359,5 @@ def _next(
             f"--out plan.csv"
         )
     if verdict is DiagnosisVerdict.NONE:
-        out.append("the model may be used as it is; a trial in other conditions would tell more")
+        out.append("nothing has to be mended; a trial in other conditions would tell more")
     return out

@@ -118,7 +118,6 @@ def comparison_page(
             *_noise_sentences(comparison),
             *comparison.notes,
             *dict.fromkeys(g.sentence for row in comparison.runs for run in row for g in run.gaps),
-            *[t.sentence for t in tests],
             *[
                 f"{name}: {d.sentence}"
                 for name, differences in zip(comparison.names, comparison.conditions, strict=True)
@@ -203,10 +202,10 @@ def run_picture(
 def _noise_sentences(comparison: Comparison) -> list[str]:
     """Return how much of the error of the best model is noise."""
     verdict = comparison.verdict
-    if not verdict.shares or verdict.diverging:
+    if verdict.diverging:
         return []
     of = f" of '{verdict.best}'" if verdict.models > 1 else ""
-    return [noise_sentence(verdict.shares, verdict.bounds, of)]
+    return noise_sentence(verdict.shares, verdict.bounds, of)
 
 
 def _left_out(comparison: Comparison) -> list[str]:

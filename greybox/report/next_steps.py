@@ -110,7 +110,7 @@ def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextSt
             )
         )
     if level is PredictionLevel.GOOD:
-        steps += _predict(model, estimate.vessel, turns)
+        steps += predict_step(model, estimate.vessel, turns)
     if level is PredictionLevel.NOT_JUDGED:
         steps.append(
             NextStep(
@@ -129,7 +129,7 @@ def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextSt
     return steps or [_use(model)]
 
 
-def _predict(model: str, vessel: Vessel, turns: bool) -> list[NextStep]:
+def predict_step(model: str, vessel: Vessel, turns: bool) -> list[NextStep]:
     """Return the manoeuvre that a model predicts, of a ship that can be steered for it."""
     from greybox.prediction.helm import find_helm
     from greybox.prediction.steady import kept_from_straight
@@ -235,7 +235,7 @@ def after_comparison(
     if verdict.diverging or verdict.weak:
         return [wrong]
     turns = "r" in models[best].structure.states
-    steps = _predict(model, models[best].vessel, turns) or [_use(model)]
+    steps = predict_step(model, models[best].vessel, turns) or [_use(model)]
     if verdict.rivals:
         steps.append(NextStep("Tell these models apart on further logs", again))
     elif verdict.beyond_noise:
