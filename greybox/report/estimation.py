@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import MOTION_WORDS
+from greybox.errors import so_many
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.summary import (
@@ -134,12 +135,12 @@ def _summary(estimate: Estimate) -> list[str]:
     method = ESTIMATORS[estimate.method].description
     if estimate.prefilter == "noise":
         method += ", refined by the noise"
-    logs = len(estimate.logs)
     told = [
-        f"{len(estimate.names)} parameters of structure '{estimate.predictor.structure.name}' by "
+        f"{so_many(len(estimate.names), 'parameter')} of structure "
+        f"'{estimate.predictor.structure.name}' by "
         f"{method}, predictor '{estimate.predictor.kind}', from {estimate.kept} of "
-        f"{estimate.samples} samples of {estimate.sample_time:g} s in {logs} "
-        f"log{'s' * (logs != 1)}.",
+        f"{estimate.samples} samples of {estimate.sample_time:g} s in "
+        f"{so_many(len(estimate.logs), 'log')}.",
         # the headline has the others
         *(
             _sentence(r.sentence)

@@ -93,13 +93,7 @@ def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextSt
     short = max((log["samples"] for log in estimate.logs), default=SHORTEST) < SHORTEST
     doubtful = level in _DOUBTED or trust is TrustLevel.DO_NOT_TRUST
     if doubtful and short:
-        steps.append(
-            NextStep(
-                f"Sail a longer trial, since a diagnosis needs {SHORTEST} samples; plan it with "
-                f"this model",
-                f"greybox design --vessel {vessel} --model {model} --duration 900 --out plan.csv",
-            )
-        )
+        steps.append(_sail_longer(vessel, model))
     elif doubtful:
         held = f" --validate {validate}" if validate else ""
         held += "" if turns else f" --structure {shlex.quote(structure.name)}"
@@ -127,6 +121,15 @@ def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextSt
             )
         )
     return steps or [_use(model)]
+
+
+def _sail_longer(vessel: str, model: str) -> NextStep:
+    from greybox.diagnosis.preparing import SHORTEST
+
+    return NextStep(
+        f"Sail a longer trial, since a diagnosis needs {SHORTEST} samples; plan it with this model",
+        f"greybox design --vessel {vessel} --model {model} --duration 900 --out plan.csv",
+    )
 
 
 def predict_step(model: str, vessel: Vessel, turns: bool) -> list[NextStep]:
@@ -228,10 +231,14 @@ def after_comparison(
     fewer = fewer_terms(models[best])
     if verdict.diverging and fewer:
         return [NextStep(f"Estimate fewer terms than '{name}' has, and compare again", fewer)]
+    from greybox.diagnosis.preparing import SHORTEST
+
     wrong = NextStep(
         f"Find what '{name}' gets wrong in these logs, and why",
         f"greybox diagnose {logs} --vessel {vessel} --model {model} --report diagnosis.html",
     )
+    if max(run.samples for run in comparison.runs[best]) < SHORTEST:
+        wrong = _sail_longer(vessel, model)
     if verdict.diverging or verdict.weak:
         return [wrong]
     turns = "r" in models[best].structure.states

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS, MOTION_WORDS
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.model.model import ManoeuvringModel
 from greybox.model.run.changes import Change
 from greybox.model.run.inputs import LogInputs
@@ -167,7 +167,7 @@ class LogFit(DisplayMixin):
 
     def _line(self) -> str:
         end = f", diverged at sample {self.diverged}" if self.diverged >= 0 else ""
-        return f"free run on '{self.log.name}', {len(self.log)} samples{end}"
+        return f"free run on '{self.log.name}', {so_many(len(self.log), 'sample')}{end}"
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
         rows = []

@@ -65,7 +65,7 @@ def test_estimate_simulate_compare(tmp_path, capsys):
     compared = json.loads(result.read_text())
     assert [m["model"] for m in compared["models"]] == ["m", "ls"]
     assert set(compared["models"][0]["logs"][0]["fit"]) == {"u", "v", "r"}
-    assert "'m' was estimated on these logs: how it fits there" in capsys.readouterr().out
+    assert "'m' was estimated on this log: how it fits there" in capsys.readouterr().out
     raw = tmp_path / "raw.csv"
     raw.write_text("tvec,u\n0,1\n")
     assert run("simulate", model, raw, "--out", out) == 1
@@ -316,7 +316,7 @@ def test_reproduce_chapter7_on_logs(tmp_path, capsys):
     assert run("reproduce", "chapter7", "--vessel", "thesis", "--estimate", *files[:2],
                "--validate", files[2], "--runs", "5", "--out", tmp_path / "c7") == 0  # fmt: skip
     told = capsys.readouterr().out
-    assert "estimation sets: 2 of 1 logs" in told
+    assert "estimation sets: 2 of 1 log;" in told
     assert "note: --runs changed nothing" in told
     assert (tmp_path / "c7" / "table_7.1.png").exists()
 
@@ -409,7 +409,8 @@ def test_next_steps_name_the_files_of_the_user():
     assert len(filled) == 2
     model = SimpleNamespace(record={"provenance": record}, structure=get_structure("thesis"))
     verdict = SimpleNamespace(best="mine", in_sample=(), untested=False, diverging=None, weak=["u"])
-    best = SimpleNamespace(verdict=verdict, best=lambda: 0)
+    runs = [[SimpleNamespace(samples=600)]]
+    best = SimpleNamespace(verdict=verdict, best=lambda: 0, runs=runs)
     (step,) = after_comparison(
         best, [model], {"command": {"models": ["mine.json"], "log": ["day 2.csv"]}}
     )
