@@ -34,7 +34,7 @@ def weak_channels(
         Fit (6.12) of each state, and that of a perfect model where the sensor's noise is
         known [%]: noise may hide a channel, which is no fault of the model.
     still : collection of str
-        States that hardly moved and do not decide.
+        States that moved too little to matter, which do not decide.
     """
     return [
         s for s, f in fit.items()
@@ -135,7 +135,9 @@ class ComparisonVerdict:
         Fit that a perfect model would have there [%], and the share of sensor noise in the
         squared error, by state whose noise is known.
     still : tuple of str
-        States that hardly moved.
+        States that moved too little to matter: these do not decide.
+    untested : bool
+        Whether no state moved beyond its noise, so that nothing is known of the prediction.
     diverging : RunsDiverge or None
         Of the best model.
     differences : tuple of Difference
@@ -152,6 +154,7 @@ class ComparisonVerdict:
     bounds: Mapping[str, float]
     shares: Mapping[str, float]
     still: tuple[str, ...]
+    untested: bool
     diverging: RunsDiverge | None
     differences: tuple[Difference, ...]
     in_sample: tuple[str, ...]
@@ -170,11 +173,6 @@ class ComparisonVerdict:
     def beyond_noise(self) -> list[str]:
         """States whose error is more than the noise of their sensor explains."""
         return beyond_noise(self.fit, self.bounds, self.still)
-
-    @property
-    def untested(self) -> bool:
-        """Whether nothing moved beyond noise, so that nothing is known of the prediction."""
-        return set(self.still) == set(self.fit)
 
     @property
     def sentence(self) -> str:
@@ -235,6 +233,7 @@ class ComparisonVerdict:
             "noise_fit": dict(self.bounds),
             "noise_share": dict(self.shares),
             "hardly_moved": list(self.still),
+            "untested": self.untested,
             "diverging": self.diverging and self.diverging.to_dict(),
             "differences": [d.to_dict() for d in self.differences],
             "rivals": list(self.rivals),
@@ -297,7 +296,8 @@ def judge_comparison(
         fits[best],
         {s: float(np.mean([one[s].fit for one in told])) for s in noisy},
         {s: of_noise(s) for s in noisy},
-        tuple(s for s in noisy if not any(one[s].moves for one in told)),
+        tuple(s for s in noisy if not any(one[s].matters for one in told)),
+        len(noisy) == len(fits[best]) and not any(one[s].moves for one in told for s in noisy),
         leaving[best],
         tuple(differences),
         tuple(n for n in equals if any(own[names.index(n)][k] for k in judged)),

@@ -78,21 +78,30 @@ class NoiseBeside:
         Fit (6.12) that a perfect model would have [%].
     moves : bool
         Whether the channel moves by more than its noise, and enough to matter.
+    matters : bool
+        Whether it moves enough to matter, whatever its noise hides of that.
     """
 
     std: float
     fit: float
     moves: bool
+    matters: bool
 
 
 def noise_beside(held: HeldOut) -> dict[str, NoiseBeside]:
     """Return what sensor noise leaves of the error of a run, by state whose noise is known."""
     run, states = held.run, tuple(held.run.fit)
     noise, (spread, _) = _noise([held], states), _errors([held], states)
-    moves = _moves([run], states, spread, noise, held.model.vessel.length)
+    moves, matters = (
+        _moves([run], states, spread, beside, held.model.vessel.length)
+        for beside in (noise, np.zeros(len(states)))
+    )
     return {
         s: NoiseBeside(
-            float(noise[i]), noise_fit(run.log[s][run.log.known((s,))], noise[i]), bool(moves[i])
+            float(noise[i]),
+            noise_fit(run.log[s][run.log.known((s,))], noise[i]),
+            bool(moves[i]),
+            bool(matters[i]),
         )
         for i, s in enumerate(states)
         if np.isfinite(noise[i]) and run.log.known((s,)).any()
