@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from greybox.channels import MOTION_WORDS
 from greybox.model.model import ManoeuvringModel
 from greybox.report.chart import chart_of
 from greybox.report.error_budget import noise_sentence
 from greybox.report.figures import comparison_figure, to_svg
 from greybox.report.next_steps import after_comparison
-from greybox.report.page import Page, Picture, Table, computed
+from greybox.report.page import Page, Picture, Table, capital, computed
 from greybox.report.thinning import points_for
 from greybox.validation.bands import LEVEL, Bands
 from greybox.validation.comparison import Comparison, rmse_titles
@@ -59,7 +60,7 @@ def comparison_page(
     noise_rows = [
         [
             name, run.log.name, s, percent(run.fit[s]).removesuffix(" %"), f"{n.fit:.1f}",
-            f"{errors[s]:.3g}", f"{n.std:.2g}", "" if n.moves else "hardly moved",
+            f"{errors[s]:.3g}", f"{n.std:.2g}",
         ]
         for name, row, noises, rmse in zip(
             comparison.names, comparison.runs, comparison.noise, comparison.rmse, strict=True
@@ -73,7 +74,7 @@ def comparison_page(
             Table(
                 "What sensor noise allows: the fit of a perfect model, and the error of noise "
                 "alone [m/s, rad/s]",
-                ["model", "log", "state", "fit [%]", "at most [%]", "error", "noise alone", ""],
+                ["model", "log", "state", "fit [%]", "at most [%]", "error", "noise alone"],
                 noise_rows,
             ),
         )
@@ -205,7 +206,15 @@ def _noise_sentences(comparison: Comparison) -> list[str]:
     if verdict.diverging:
         return []
     of = f" of '{verdict.best}'" if verdict.models > 1 else ""
-    return noise_sentence(verdict.shares, verdict.bounds, of)
+    still = [
+        f"{MOTION_WORDS.get(s, s)} hardly moved on {run.log.name} and tells little there."
+        for run, noise in zip(
+            comparison.runs[comparison.best()], comparison.noise[comparison.best()], strict=True
+        )
+        for s, n in noise.items()
+        if not n.moves
+    ]
+    return [*noise_sentence(verdict.shares, verdict.bounds, of), *map(capital, still)]
 
 
 def _left_out(comparison: Comparison) -> list[str]:
