@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from experiment_design.excitation.rollout import Motion
 from experiment_design.information.envelope import Envelope
 from experiment_design.request.request import PreparedRequest
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.model.model import ManoeuvringModel
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import run_model
@@ -73,7 +73,7 @@ class Sailed:
 
     def sentence(self) -> str:
         """Return how much has been sailed."""
-        return f"{self.seconds:.0f} s of {self.logs} log{'s' if self.logs != 1 else ''}"
+        return f"{self.seconds:.0f} s of {so_many(self.logs, 'log')}"
 
 
 def sailed_trial(model: ManoeuvringModel, segments: Sequence[TrialLog], logs: int) -> Sailed:

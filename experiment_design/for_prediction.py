@@ -40,7 +40,7 @@ from experiment_design.request.regimes import STEADY_SECONDS, start_words
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.channels import CHANNELS
 from greybox.diagnosis.result import finite
-from greybox.errors import InfeasibleError, VesselError
+from greybox.errors import InfeasibleError, VesselError, so_many
 from greybox.estimation.prediction_verdict import HeldCommandsDiverge
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import build_predictor
@@ -179,7 +179,7 @@ class PredictionDesign:
             for n, (low, high) in self.commands.items()
         )
         lines = [
-            f"Plan for {r.vessel.name}: {r.trials} trial{'s' if r.trials > 1 else ''} of "
+            f"Plan for {r.vessel.name}: {so_many(r.trials, 'trial')} of "
             f"{r.duration:g} s for prediction, both sides, {ranges}",
             *(["planned without an estimated model, from main dimensions"] if r.untried else []),
             self.headline(),

@@ -12,7 +12,7 @@ from experiment_design.constraints.limits import Limit
 from experiment_design.information.moments import Moments
 from experiment_design.optimise.campaign import add_up
 from experiment_design.request.request import PreparedRequest, build_problem, wanted_parameters
-from greybox.errors import ExcitationError, UsageError
+from greybox.errors import ExcitationError, UsageError, so_many
 from greybox.notebook import DisplayMixin, items, number, table
 from greybox.numerics.linalg import scaled_logdet
 
@@ -59,7 +59,7 @@ class PredictedPrecision(DisplayMixin):
     def _line(self) -> str:
         missed = len(self._missed())
         kept = f"{missed} limits missed" if missed else "all limits kept"
-        return f"predicted precision of {len(self.names)} parameters, {kept}"
+        return f"predicted precision of {so_many(len(self.names), 'parameter')}, {kept}"
 
     def _parts(self) -> tuple[str, ...]:
         rows = [(n, number(s, 3)) for n, s in zip(self.names, self.std, strict=True)]
@@ -95,7 +95,10 @@ def predict_precision(
     Ljungberg (2020), eqs. 2.21 and 4.63.
     """
     if len(plans) != request.trials:
-        raise UsageError(f"{len(plans)} plans for {request.trials} trials: give one per trial.")
+        raise UsageError(
+            f"{so_many(len(plans), 'plan')} for {so_many(request.trials, 'trial')}: give one "
+            f"per trial."
+        )
     names = request.schedule.commands
     samples = request.schedule.samples
     sums: list[tuple[Moments, ...]] = []

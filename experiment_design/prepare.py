@@ -43,7 +43,7 @@ from experiment_design.request.request import (
     build_problem,
     full_structure,
 )
-from greybox.errors import InfeasibleError, StructureError, UsageError
+from greybox.errors import InfeasibleError, StructureError, UsageError, so_many
 from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.semi_empirical import METHOD as SEMI_EMPIRICAL
@@ -234,7 +234,7 @@ def _prepared(
     else:
         if len(parts) not in (1, asked.trials):
             raise UsageError(
-                f"--regime names {len(parts)} regimes for {asked.trials} "
+                f"--regime names {so_many(len(parts), 'regime')} for {asked.trials} "
                 f"trial{'s' if asked.trials > 1 else ''}: give one, or one per trial."
             )
         regimes = tuple(parts * asked.trials if len(parts) == 1 else parts)

@@ -78,6 +78,17 @@ class ConfigurationError(GreyboxError, ValueError):
     """The configuration file names what does not exist, or gives it a value it cannot have."""
 
 
+def so_many(count: int, noun: str, one: str = "", many: str = "") -> str:
+    """Return a number with its noun, in the plural but for 1, and a verb for one or for many.
+
+    ``so_many(1, "row", "repeats", "repeat")`` is ``1 row repeats``.
+    """
+    several = count != 1
+    ending = "es" if noun.endswith(("s", "x", "ch", "sh")) else "s"
+    verb = many if several else one
+    return f"{count} {noun}{ending * several}{f' {verb}' if verb else ''}"
+
+
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Return `` Did you mean 'x'?`` for the known name nearest to `name`, or ``""``."""
     found = nearest(name, known)

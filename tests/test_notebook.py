@@ -10,7 +10,7 @@ from virtual import virtual_log
 
 import experiment_design as ed
 import greybox as gb
-from greybox.diagnosis.result import Diagnosis, Found, Gain, Quantity, Symptom
+from greybox.diagnosis.result import Diagnosis, Found, Quantity, Symptom
 from greybox.estimation.verdict import SharedMoment
 from greybox.notebook import interval, number, sparkline, table
 from greybox.selection.structures import StructureChoice, StructureRow
@@ -18,6 +18,7 @@ from greybox.trial.checks.finding import Outcome
 from greybox.trial.raw_log import Signal
 from greybox.trial.steps import Step
 from greybox.trial.trial_summary import Contents
+from greybox.validation.gain import Gain
 
 HOSTILE = "<script>alert('x')</script>&\0\"]]>"
 

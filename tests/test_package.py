@@ -48,3 +48,12 @@ def test_the_metadata_is_whole():
 @pytest.mark.parametrize("package", ["greybox", "experiment_design"])
 def test_types_are_marked(package):
     assert (ROOT / package / "py.typed").exists()
+
+
+def test_counted_nouns_are_in_the_plural_but_for_one():
+    from greybox.errors import so_many
+
+    told = [so_many(k, noun) for k, noun in ((0, "gap"), (1, "log"), (2, "stretch"), (3, "row"))]
+    assert told == ["0 gaps", "1 log", "2 stretches", "3 rows"]
+    assert so_many(1, "message", "was", "were") == "1 message was"
+    assert so_many(2, "message", "was", "were") == "2 messages were"

@@ -16,8 +16,7 @@ from experiment_design.prepare import prepare_request
 from experiment_design.request.request import DesignRequest
 from greybox.channels import MOTION_WORDS
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
-from greybox.diagnosis.gain import gains
-from greybox.diagnosis.result import Diagnosis, Found, Gain
+from greybox.diagnosis.result import Diagnosis, Found
 from greybox.errors import UsageError, suggestion
 from greybox.estimation.result import Estimate
 from greybox.files import make_folder
@@ -34,6 +33,7 @@ from greybox.trial.convert.read import read_log
 from greybox.trial.store import write_log
 from greybox.validation.comparison import Comparison, compare
 from greybox.validation.fit import LEFT
+from greybox.validation.gain import Gain, gains
 from greybox.vessel.toml import load_vessel
 
 Array = NDArray[np.float64]

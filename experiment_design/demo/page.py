@@ -15,13 +15,14 @@ from greybox.report.chart import chart_of
 from greybox.report.comparison import comparison_page
 from greybox.report.diagnosed_causes import cause_section
 from greybox.report.diagnosis import diagnosis_page, gain_picture, gain_section
-from greybox.report.error_budget import noise_bounds, noise_sentence, noise_shares
-from greybox.report.figures import to_svg, told_fits
+from greybox.report.error_budget import noise_sentence, noise_shares
+from greybox.report.figures import to_svg
 from greybox.report.log import page_figures
 from greybox.report.model_difference import marked_equations
 from greybox.report.next_steps import NextStep
 from greybox.report.page import Marked, Page, Picture, Section, Table, flatten
 from greybox.validation.comparison import Comparison
+from greybox.validation.fit import told_fits
 
 # share of the squared error from which on noise is all that is left
 _NOISE = 0.9
@@ -51,7 +52,7 @@ def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
     extended = gain_section(diagnosis).pictures
     gain, *after = [
         *(
-            [gain_picture(demo.gain, " on the other log", bounds=noise_bounds(diagnosis))]
+            [gain_picture(demo.gain, " on the other log", bounds=diagnosis.noise_bounds())]
             if extended
             else []
         ),
@@ -76,14 +77,13 @@ def demo_page(demo: Demo, record: Mapping[str, Any]) -> Page:
         _section(number, step, *parts)
         for number, (step, parts) in enumerate(zip(demo.steps, shown, strict=True), 1)
     ]
-    budget = diagnosis.budget
     return Page(
         title="The whole loop on a virtual ship",
         headline=f"{headline(diagnosis, demo)}{_only_noise(diagnosis)}",
         sentences=[
             "Each step below shows the command that does it; the files that it reads and writes "
             "stand beside this page, so that every step can be taken again by hand.",
-            *([noise_sentence(diagnosis)] if budget else []),
+            *noise_sentence(noise_shares(diagnosis), diagnosis.noise_bounds()),
         ],
         lead=gain,
         next_steps=[
@@ -116,7 +116,7 @@ def headline(diagnosis: Diagnosis, demo: Demo) -> str:
 
 def _only_noise(diagnosis: Diagnosis) -> str:
     """Return that the sensors, not the model, make the error that is left, where they do."""
-    shares, bounds = noise_shares(diagnosis), noise_bounds(diagnosis)
+    shares, bounds = noise_shares(diagnosis), diagnosis.noise_bounds()
     if not shares or min(shares.values()) < _NOISE:
         return ""
     least, most = (f"{100 * f(shares.values()):.0f}" for f in (min, max))

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiment_design.output.result import Design
-from greybox.diagnosis.result import Diagnosis, Gain
+from greybox.diagnosis.result import Diagnosis
 from greybox.estimation.result import Estimate
 from greybox.files import sha256
 from greybox.study.blind_causes import Effect
 from greybox.trial.checks.finding import CheckReport
 from greybox.trial.log import TrialLog
 from greybox.validation.comparison import Comparison
+from greybox.validation.gain import Gain
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from experiment_design.optimise.search import REFERENCE
 from experiment_design.request.regimes import spell_regime
 from experiment_design.request.request import PreparedRequest, build_problem
 from greybox.channels import CHANNELS
+from greybox.errors import so_many
 from greybox.files import replacing
 from greybox.notebook import DisplayMixin, interval, items, number, sparkline, table, text
 from greybox.numerics.linalg import scaled_logdet
@@ -313,7 +314,7 @@ class Design(DisplayMixin):
         """Return the design as text."""
         r = self.request
         lines = [
-            f"Plan for {r.vessel.name}: {r.trials} trial{'s' if r.trials > 1 else ''} of "
+            f"Plan for {r.vessel.name}: {so_many(r.trials, 'trial')} of "
             f"{r.duration:g} s{self._behind()}, commands change every {r.hold:g} s, regime "
             f"{', '.join(spell_regime(s) for s in r.regimes)}",
             f"{self.status}",

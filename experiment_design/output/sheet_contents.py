@@ -12,7 +12,7 @@ from experiment_design.output.legs import Leg, planned_ends
 from experiment_design.output.prediction import MotionBand
 from experiment_design.output.result import Design
 from experiment_design.request.regimes import spell_regime
-from greybox.errors import UsageError
+from greybox.errors import UsageError, so_many
 from greybox.prediction.helm import find_helm
 from greybox.report.page import tie_units
 from greybox.trial.plan_parts import VALIDATION
@@ -375,7 +375,8 @@ def _warnings(design: Design, band: MotionBand) -> tuple[str, ...]:
         )
     if band.lost:
         found.append(
-            f"{band.lost} of {band.draws} models drawn from the prior run away on this plan."
+            f"{band.lost} of {so_many(band.draws, 'model')} drawn from the prior "
+            f"{'runs' if band.lost == 1 else 'run'} away on this plan."
         )
     return tuple(found)
 

@@ -87,15 +87,6 @@ def _read_each(
         raise refused
 
 
-def _own_logs(name: str, model: ManoeuvringModel, hashes: Sequence[str]) -> str:
-    """Return a sentence where logs are those that the model was estimated on, else ``""``."""
-    used = {log["sha256"] for log in model.record.get("logs", ())}
-    count = sum(h in used for h in hashes)
-    which = "these logs" if count == len(hashes) else f"{count} of these {len(hashes)} logs"
-    told = f"'{name}' was estimated on {which}: how it fits there says little of other logs."
-    return told if count else ""
-
-
 def _followed(
     columns: Iterable[list[TrialLog]], excursions: Sequence[Excursions]
 ) -> Iterator[list[TrialLog]]:
@@ -164,8 +155,8 @@ def run(options: argparse.Namespace) -> None:
     )  # fmt: skip
     misnamed = (n for m in models for n in misnamed_columns(read, m.vessel))
     of = [run.log.provenance for run in comparison.runs[0]]
-    own = (_own_logs(name, model, [p.sha256 for p in of]) for name, model in named.items())
-    notes = dict.fromkeys(filter(None, (*own, *_beyond(names, excursions), *told, *misnamed)))
+    beyond = _beyond(names, excursions)
+    notes = dict.fromkeys((*comparison.notes, *beyond, *told, *misnamed))
     comparison = replace(comparison, notes=tuple(notes))
     record = provenance(options) | {"logs": [f"{p.source} {p.sha256[:12]}" for p in of]}
 
@@ -175,5 +166,5 @@ def run(options: argparse.Namespace) -> None:
         return comparison_page(comparison, models, record)
 
     result = comparison.to_dict() | {"provenance": record}
-    steps = [after_comparison(comparison, models, record)]
+    steps = after_comparison(comparison, models, record)
     publish(options, result, comparison.summary(), page, steps)

@@ -13,7 +13,7 @@ from typing import Any
 from greybox.commands.common import OUTPUTS
 from greybox.commands.completion import VESSELS, endings
 from greybox.commands.parser import Parser, sub_parsers
-from greybox.errors import ConfigurationError, nearest, suggestion
+from greybox.errors import ConfigurationError, nearest, so_many, suggestion
 
 EVERYWHERE = "all"
 PREFIX = "GREYBOX_"
@@ -142,7 +142,8 @@ def _words(action: argparse.Action, value: Any, where: str, folder: Path) -> lis
         raise ConfigurationError(f"{where} is an empty list: name a value, or leave it out.")
     if isinstance(action.nargs, int) and len(values) != action.nargs:
         raise ConfigurationError(
-            f"{where} has {len(values)} values, {action.nargs} are needed: write a list of them."
+            f"{where} has {so_many(len(values), 'value')}, {action.nargs} are needed: write a "
+            f"list of them."
         )
     if odd := [v for v in values if isinstance(v, bool) or not isinstance(v, str | int | float)]:
         raise ConfigurationError(

@@ -111,6 +111,7 @@ def run(options: argparse.Namespace) -> None:
     from functools import partial
 
     from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
+    from greybox.diagnosis.result import DiagnosisVerdict
     from greybox.files import check_targets
     from greybox.model.catalogue import get_structure, structure_for
     from greybox.model.model import load_model
@@ -162,7 +163,9 @@ def run(options: argparse.Namespace) -> None:
     )
     record = provenance(options) | {"logs": _read(logs), "validate": _read(validate)}
     steps = [*_where_antenna(diagnosis, vessel), *_with_files(diagnosis.next_steps, record)]
-    steps += _with_model(diagnosis, record)
+    used = _with_model(diagnosis, record)
+    # what needs nothing is for use first
+    steps = [*used, *steps] if diagnosis.verdict == DiagnosisVerdict.NONE else [*steps, *used]
     diagnosis = replace(
         diagnosis, next_steps=tuple(steps), notes=(*left_out, *also, *diagnosis.notes)
     )
@@ -213,12 +216,20 @@ def _where_antenna(diagnosis: Diagnosis, vessel: Vessel) -> list[str]:
 
 
 def _with_model(diagnosis: Diagnosis, record: Mapping[str, Any]) -> list[str]:
-    """Return what to do with the extended model where it was written."""
+    """Return what to do with a model that lacks nothing, or is extended and was written."""
     from shlex import quote
 
-    from greybox.report.next_steps import typed
+    from greybox.diagnosis.result import DiagnosisVerdict
+    from greybox.report.next_steps import predict_step, typed
+    from greybox.validation.comparison_verdict import weak_channels
 
     out = record["command"].get("out")
+    vessel, turns = diagnosis.model.vessel, "r" in diagnosis.model.structure.states
+    if diagnosis.verdict == DiagnosisVerdict.NONE:
+        if weak_channels(diagnosis.held_out_fit, diagnosis.noise_bounds()):
+            return []
+        model = typed(record, "model", quote(out or "MODEL"))
+        return [s.line().removeprefix("next: ") for s in predict_step(model, vessel, turns)]
     if not out or not diagnosis.causes:
         return []
     held, other = typed(record, "validate", "LOG"), typed(record, "model", "model.json")
@@ -226,8 +237,7 @@ def _with_model(diagnosis: Diagnosis, record: Mapping[str, Any]) -> list[str]:
     return [
         f"of two models, {whose} and the extended one, predict with the one that follows better "
         f"what neither was estimated on: greybox compare {other} {quote(out)} --log {held}",
-        f"predict manoeuvres with the extended model: greybox predict {quote(out)} zigzag "
-        f"--report zigzag.html",
+        *(s.line().removeprefix("next: ") for s in predict_step(quote(out), vessel, turns)),
     ]
 
 

@@ -179,8 +179,8 @@ def run(options: argparse.Namespace) -> None:
     topics = pairs(options.topic, "--topic", "TOPIC=NAME")
     if topics and not any(map(has_topics, raw)):
         raise UsageError(
-            f"--topic names {', '.join(topics)}, and none of the {len(raw)} raw files is a ROS bag "
-            f"or an MCAP file: name the bag, or leave --topic out."
+            f"--topic names {', '.join(topics)}, and no raw file is a ROS bag or an MCAP "
+            f"file: name the bag, or leave --topic out."
         )
     folder = is_folder(raw, options.out)
     logs = targets(raw, options.out) if folder else [Path(options.out)]

@@ -7,6 +7,7 @@ import logging
 from typing import TYPE_CHECKING, Literal
 
 from greybox.commands.common import add_seed, require_ending, say
+from greybox.errors import so_many
 
 if TYPE_CHECKING:
     from greybox.commands.time_left import Stage
@@ -148,5 +149,5 @@ def run(options: argparse.Namespace) -> None:
         say(f"note: {note}")
     if not fill:
         began = "from the mean of the log's first 5 samples"
-        say(f"free run of {len(result.log)} samples {began}, fit {shown}")
+        say(f"free run of {so_many(len(result.log), 'sample')} {began}, fit {shown}")
     say(f"wrote {options.out}")

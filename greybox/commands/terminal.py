@@ -26,9 +26,13 @@ Item = TypeVar("Item")
 LOGGERS = ("greybox", "experiment_design")
 _log = logging.getLogger(__name__)
 _QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
-_VERDICT = r"(?m)^((?:[Vv]erdict|Prediction|Coefficients): )(do not trust|trust except|\w+)"
+_VERDICT = (
+    r"(?m)^((?:[Vv]erdict|Prediction|Coefficients): )"
+    r"([Dd]o not (?:trust|predict)|You can predict|trust except|\w+)"
+)
 # red and green; other verdicts are yellow
-_TONES = {"do not trust": 31, "poor": 31, "unexplained": 31, "trust": 32, "good": 32, "none": 32}
+_TONES = {"do not trust": 31, "Do not predict": 31, "poor": 31, "unexplained": 31,
+          "You can predict": 32, "trust": 32, "good": 32, "none": 32}  # fmt: skip
 # the bar that is on the screen: one at most, and drawn by the first process, not by its copies
 _shown: list[Progress] = []
 _FIRST = os.getpid()

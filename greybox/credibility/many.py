@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from greybox.credibility.evidence import Equation
 from greybox.credibility.weak import orthonormal
+from greybox.errors import so_many
 from greybox.estimation.verdict import TestResult, not_applicable
 from greybox.numerics.lagged_moments import lagged_products
 from greybox.numerics.linalg import scaled_inverse
@@ -78,7 +79,8 @@ def many_instruments(equation: Equation, biases: frozenset[str]) -> TestResult:
         null,
         abs(ratio[worst]),
         None,
-        f"the instruments of {len(equation.z)} logs bias the estimate towards least squares, most "
+        f"the instruments of {so_many(len(equation.z), 'log')} bias the estimate towards least "
+        f"squares, most "
         f"{worst}, by {ratio[worst]:+.2f} standard errors"
         + (f" ({', '.join(hit)} by more than half): use fewer, longer logs." if hit else "."),
         TOLERATED_BIAS,

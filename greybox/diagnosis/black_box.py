@@ -27,10 +27,9 @@ from greybox.diagnosis.evidence.features import through_water
 from greybox.diagnosis.evidence.held_out import Pair
 from greybox.diagnosis.extension import noise_levels, one_step_deviations
 from greybox.diagnosis.fitting import Problem, stacked
-from greybox.diagnosis.gain import gains, runs_on
-from greybox.diagnosis.null_model import DiagnosisProblem
+from greybox.diagnosis.null_model import DiagnosisProblem, runs_on
 from greybox.diagnosis.point import Fit, Point
-from greybox.diagnosis.result import Diagnosis, Gain, Remainder
+from greybox.diagnosis.result import Diagnosis, Remainder
 from greybox.diagnosis.ship import LogRun
 from greybox.model.model import ManoeuvringModel
 from greybox.model.structure import Structure
@@ -38,6 +37,7 @@ from greybox.model.terms import EQUATIONS, Factor, Term
 from greybox.numerics.lagged_moments import correlation_factor
 from greybox.trial.log import TrialLog
 from greybox.validation.bands import joint_covariance
+from greybox.validation.gain import Gain, gains
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from greybox.diagnosis.evidence.held_out import Pair, change_scenarios
 from greybox.diagnosis.evidence.remainder import generic_force
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.gain import block_sums, blocks
 from greybox.diagnosis.noise import Noise, fit_noise
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.result import BudgetPart
@@ -32,6 +31,7 @@ from greybox.diagnosis.ship import LogRun, Ship
 from greybox.diagnosis.thresholds import GUST
 from greybox.diagnosis.waves import Waves, noise_in
 from greybox.trial.log import TrialLog
+from greybox.validation.gain import block_sums, blocks
 
 Array = NDArray[np.float64]
 

@@ -29,9 +29,8 @@ from greybox.diagnosis.evidence.kinematics import denied
 from greybox.diagnosis.evidence.standing import standing
 from greybox.diagnosis.extension import extended_model
 from greybox.diagnosis.fitting import Problem
-from greybox.diagnosis.gain import gains, run_on, runs_on
 from greybox.diagnosis.hypothesis import Hypothesis
-from greybox.diagnosis.null_model import FOLDS, DiagnosisProblem
+from greybox.diagnosis.null_model import FOLDS, DiagnosisProblem, run_on, runs_on
 from greybox.diagnosis.point import Fit, Point
 from greybox.diagnosis.quantities import quantities_of
 from greybox.diagnosis.residuals import residual_tests
@@ -39,7 +38,6 @@ from greybox.diagnosis.result import (
     BudgetPart,
     Diagnosis,
     Found,
-    Gain,
     Quantity,
     Ranked,
     Runs,
@@ -61,6 +59,7 @@ from greybox.trial.log import TrialLog
 from greybox.trial.validity import ranges, settings_of
 from greybox.validation.bands import LEVEL, Z, predict_bands
 from greybox.validation.fit import LogFit, fit_on
+from greybox.validation.gain import Gain, gains
 
 Array = NDArray[np.float64]
 
@@ -572,6 +571,9 @@ def _likelier_story(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> Manoeu
 
 def _as_shown(before: LogFit, after: LogFit) -> dict[str, Array]:
     """Return a run on a corrected log as its sensors would show it on the log as it is."""
+    if all(np.array_equal(before.log[s], after.log[s]) for s in after.fit):
+        # to the last digit: a model that stays as it is has one run
+        return {s: after.x[:, i] for i, s in enumerate(after.fit)}
     if before.log.t[0] == after.log.t[0] and len(before.log) == len(after.log):
         place = np.arange(len(after.log))
     else:

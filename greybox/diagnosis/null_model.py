@@ -17,6 +17,7 @@ from greybox.diagnosis.ship import Change, LogRun, Ship, shifted, wired
 from greybox.errors import ExcitationError
 from greybox.estimation.free_run import fit_free_runs
 from greybox.estimation.output_setup import measured, output_model, output_predictor
+from greybox.model.model import ManoeuvringModel
 from greybox.model.predictor import Predictor, Regime, build_predictor
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.run.step import Integrator
@@ -25,8 +26,10 @@ from greybox.model.terms import parse_term
 from greybox.numerics.parallel import map_forked
 from greybox.regression.regression import build_regression
 from greybox.rotation import body_to_ned, ned_to_body
+from greybox.trial.convert.sensor_corrections import correct_log
 from greybox.trial.log import TrialLog
 from greybox.trial.segments import of_one_log
+from greybox.validation.fit import LogFit, run_model
 from greybox.vessel.vessel import Vessel
 
 Array = NDArray[np.float64]
@@ -57,6 +60,19 @@ def clocks_of(logs: Sequence[TrialLog]) -> list[Clock]:
         (float(logs[places[0]].t[0]), float(logs[places[-1]].t[-1] - logs[places[0]].t[0]))
         for places in of_one_log(logs)
         for _ in places
+    ]
+
+
+def run_on(model: ManoeuvringModel, log: TrialLog) -> LogFit:
+    """Run a model on a log as its vessel file reads it."""
+    return runs_on(model, [log])[0]
+
+
+def runs_on(model: ManoeuvringModel, logs: Sequence[TrialLog]) -> list[LogFit]:
+    """Run a model on each log, its changes by the clock of the log that each is a segment of."""
+    return [
+        run_model(model, correct_log(log, model.vessel), first=float(log.t[0]) - origin)
+        for log, (origin, _) in zip(logs, clocks_of(logs), strict=True)
     ]
 
 

@@ -15,8 +15,10 @@ from greybox.estimation.verdict import TestResult
 from greybox.model.model import ManoeuvringModel
 from greybox.notebook import DisplayMixin, interval, items, number, table, text, with_error
 from greybox.trial.log import TrialLog
+from greybox.trial.segments import of_one_log
 from greybox.trial.validity import ConditionDifference
-from greybox.validation.fit import LEFT
+from greybox.validation.fit import LEFT, noise_fit
+from greybox.validation.gain import Gain
 
 Array = NDArray[np.float64]
 
@@ -136,19 +138,6 @@ class Found:
             return "the log itself shows it, without a free run"
         which = "without" if self.held_out > 0 else "with"
         return f"the held-out free run leaves every bound {which} it"
-
-
-@dataclass(frozen=True)
-class Gain:
-    """Fit (6.12) of the free run before and after, with a 95 % interval of the difference [%]."""
-
-    before: float
-    after: float
-    ci: tuple[float, float]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the gain for JSON."""
-        return {"before": self.before, "after": self.after, "ci": list(self.ci)}
 
 
 @dataclass(frozen=True)
@@ -360,7 +349,7 @@ class Diagnosis(DisplayMixin):
         if self.verdict == DiagnosisVerdict.CONFUSED:
             return (
                 f"Something is wrong, and these logs cannot tell which cause it is: "
-                f"{' or '.join(self.groups[0])}."
+                f"{'; '.join(' or '.join(group) for group in self.groups)}."
             )
         if self.verdict == DiagnosisVerdict.NONE and self.wrong:
             return (
@@ -369,6 +358,39 @@ class Diagnosis(DisplayMixin):
             )
         said = f"{_SAID[self.verdict][0].upper()}{_SAID[self.verdict][1:]}."
         return f"{said} {self.remaining}" if self.verdict == DiagnosisVerdict.UNEXPLAINED else said
+
+    @property
+    def extended(self) -> bool:
+        """Whether the model was extended: by causes, by one of those that cannot be told apart."""
+        return bool(self.causes or self.groups) or self.model.structure != self.base.structure
+
+    @property
+    def held_out_fit(self) -> dict[str, float]:
+        """Fit of the model's free run on what is held out [%], of the extended one if it was."""
+        return {s: g.after if self.extended else g.before for s, g in self.gain.items()}
+
+    def noise_bounds(self) -> dict[str, float]:
+        """Return the fit (6.12) [%] of a perfect model on the held-out logs, by state.
+
+        Empty where the noise is not known, or nothing was held out.
+        """
+        noise, held = self.model.noise, [run for run in self.runs if run.held_out]
+        if noise is None or not held:
+            return {}
+        # as the fit is: of each log about its own mean
+        logs = [[held[k] for k in places] for places in of_one_log([run.log for run in held])]
+        return {
+            state: float(
+                np.mean(
+                    [
+                        noise_fit(np.concatenate([run.measured[state] for run in log]), float(std))
+                        for log in logs
+                    ]
+                )
+            )
+            for state, std in zip(noise.states, noise.measurement, strict=True)
+            if state in held[0].measured
+        }
 
     def to_dict(self) -> dict[str, Any]:
         """Return the diagnosis as the documented JSON, and further entries."""

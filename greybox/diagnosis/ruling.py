@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from greybox.diagnosis.evidence.held_out import HeldOut, Pair, proof_of, worse
 from greybox.diagnosis.evidence.omnibus import Omnibus, disagreement, omnibus
 from greybox.diagnosis.point import Fit
-from greybox.diagnosis.result import DiagnosisVerdict, Found, Gain, file_word
+from greybox.diagnosis.result import DiagnosisVerdict, Found, file_word
 from greybox.diagnosis.search import Candidate, Search, left_to_motion
 from greybox.diagnosis.ship import LogRun
 from greybox.diagnosis.symptoms import moved_beside, word
@@ -33,6 +33,7 @@ from greybox.diagnosis.thresholds import (
 )
 from greybox.diagnosis.waves import Waves, noise_in, squares_in
 from greybox.model.run.step import Integrator
+from greybox.validation.gain import Gain
 
 Array = NDArray[np.float64]
 
@@ -342,6 +343,11 @@ def _next(
             "--out estimated.json"
         )
     elif verdict in (DiagnosisVerdict.UNEXPLAINED, DiagnosisVerdict.PARTLY):
+        if verdict is DiagnosisVerdict.UNEXPLAINED:
+            out.append(
+                "see whether sensors and the vessel file are right: greybox check LOGS --vessel V "
+                "--report check.html"
+            )
         out.append(
             "measure what the model does not know (wind, depth, draught, propeller and rudder as "
             "they really moved), repeat a run of these logs, and diagnose both together"
@@ -353,5 +359,5 @@ def _next(
             f"--out plan.csv"
         )
     if verdict is DiagnosisVerdict.NONE:
-        out.append("the model may be used as it is; a trial in other conditions would tell more")
+        out.append("nothing has to be mended; a trial in other conditions would tell more")
     return out

@@ -43,6 +43,7 @@ from greybox.diagnosis.thresholds import (
     SURE,
     WORTH,
 )
+from greybox.errors import so_many
 from greybox.model.run.step import Integrator
 from greybox.numerics.linalg import bounded_step
 from greybox.numerics.parallel import map_forked
@@ -278,7 +279,7 @@ def search(
 def _told(steps: Sequence[Step], progress: Callable[[str], None]) -> None:
     """Say what the last step found."""
     step = steps[-1]
-    progress(f"step {len(steps)}: {len(step.scores)} causes scored")
+    progress(f"step {len(steps)}: {so_many(len(step.scores), 'cause')} scored")
     _log.info(
         "step %d: %d causes scored, %s", len(steps), len(step.scores),
         "none holds" if step.taken is None else f"{step.taken.hypothesis.cause} holds",

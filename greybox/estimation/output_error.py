@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import ExcitationError, UsageError, suggestion
+from greybox.errors import ExcitationError, UsageError, so_many, suggestion
 from greybox.estimation.covariance import (
     LEFT,
     Covariance,
@@ -324,7 +324,8 @@ def _require_rows(model: OutputModel, data: Sequence[Measured]) -> None:
     most = _ROWS * unknown
     if rows <= most or min(int(d.known.sum()) for d in data) < 3:
         raise ExcitationError(
-            f"{rows} samples and {unknown} unknowns (parameters, disturbance means and initial "
+            f"{so_many(rows, 'sample')} and {so_many(unknown, 'unknown')} (parameters, "
+            f"disturbance means and initial "
             f"states): more than {most} samples, and 3 in each log, are needed. Use a longer log "
             f"or a smaller structure."
         )

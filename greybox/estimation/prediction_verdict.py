@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from greybox.channels import MOTION_WORDS
+from greybox.errors import so_many
 from greybox.estimation.verdict import Divergence, Reason
 from greybox.notebook import DisplayMixin, number, table
 
@@ -169,6 +170,11 @@ class ChannelPrediction:
         return channel_words(self.channel)
 
 
+def _in_runs(lost: int, count: int) -> str:
+    """Return in how many runs of several, and that the time that follows is the first one's."""
+    return f" in {lost} of {count} runs, first" if count > 1 else ""
+
+
 @dataclass(frozen=True)
 class RunsDiverge(Reason):
     """Free runs leave their bound.
@@ -191,10 +197,8 @@ class RunsDiverge(Reason):
     @property
     def sentence(self) -> str:
         """How many, and when."""
-        return (
-            f"its free run diverges in {len(self.logs)} of {self.count} runs, first after "
-            f"{seconds(self.after)}"
-        )
+        where = _in_runs(len(self.logs), self.count)
+        return f"its free run diverges{where} after {seconds(self.after)}"
 
 
 class RefitsDiverge(RunsDiverge):
@@ -207,8 +211,8 @@ class RefitsDiverge(RunsDiverge):
     def sentence(self) -> str:
         """How many, and when."""
         return (
-            f"estimated without a part of the logs its free run on this part diverges in "
-            f"{len(self.logs)} of {self.count} runs, first after {seconds(self.after)}"
+            f"estimated without a part of the logs its free run on this part diverges"
+            f"{_in_runs(len(self.logs), self.count)} after {seconds(self.after)}"
         )
 
 
@@ -245,7 +249,8 @@ class Elsewhere(Reason):
         else:
             what = f"{'a log' if self.whole else 'parts of the log'} that the estimate did not use"
         if self.diverged:
-            far = f"its free run diverges in {self.diverged} of {self.count} runs"
+            far = "its free run diverges"
+            far += f" in {self.diverged} of {self.count} runs" * (self.count > 1)
         else:
             worst = max(self.errors, key=lambda c: self.errors[c])
             far = (
@@ -407,12 +412,17 @@ class NotRefitted(Reason):
     fatal: ClassVar[bool] = False
 
     @property
+    def _left(self) -> str:
+        return f"{self.parts} of {self.count} parts {'was' if self.parts == 1 else 'were'}"
+
+    @property
     def sentence(self) -> str:
         """How many, and what the first lacks."""
         if not self.in_time:
-            return f"{self.parts} of {self.count} parts were not judged: {TOO_SHORT}"
+            return f"{self._left} not judged: {TOO_SHORT}"
         return (
-            f"{self.parts} of {self.count} parts were not judged: without them the logs do not "
+            f"{self._left} not judged: without {'it' if self.parts == 1 else 'them'} the logs "
+            f"do not "
             f"suffice for an estimate ({self.because.rstrip('.')})"
         )
 
@@ -527,8 +537,8 @@ class DrawsDiverge(Reason):
     def sentence(self) -> str:
         """On how many logs."""
         return (
-            f"in {len(self.logs)} of {self.count} runs half of the models within its standard "
-            f"errors diverge, so it has no bands"
+            f"{f'in {len(self.logs)} of {self.count} runs ' * (self.count > 1)}half of the models "
+            f"within its standard errors diverge, so it has no bands"
         )
 
 
@@ -619,9 +629,9 @@ class PredictionVerdict(DisplayMixin):
         """What the prediction was judged on, in words."""
         several = len(set(self.logs)) > 1
         return {
-            JudgedOn.HELD_OUT: f"{self.parts} parts of the log{'s' * several}, each left out of "
-            f"an estimate in turn",
-            JudgedOn.VALIDATION: f"{len(self.logs)} log{'s' * (len(self.logs) != 1)} kept from the "
+            JudgedOn.HELD_OUT: f"{so_many(self.parts, 'part')} of the log{'s' * several}, "
+            + ("each left out of an estimate in turn" if self.parts != 1 else "left out of it"),
+            JudgedOn.VALIDATION: f"{so_many(len(self.logs), 'log')} kept from the "
             f"estimate that was judged",
             JudgedOn.OWN: f"the log{'s' * several} of the estimate",
         }[self.judged_on]

@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import ExcitationError, UsageError
+from greybox.errors import ExcitationError, UsageError, so_many
 from greybox.estimation.covariance import (
     Covariance,
     CovarianceKind,
@@ -180,7 +180,7 @@ def iterate_instruments(
             moved = np.abs(_coefficients(solutions) - previous)
             # a halfway model settles too, but not at an estimate that can be simulated
             if candidate is target and stays(moved, previous, instruments, solutions):
-                iteration = Iteration(count, f"converged after {count} refinements")
+                iteration = Iteration(count, f"converged after {so_many(count, 'refinement')}")
                 break
         else:
             if refine is True:
@@ -413,8 +413,10 @@ def solve_equations(
         mine = predictor.equation(state)
         if kept <= 2 * len(mine):
             raise ExcitationError(
-                f"{kept} of {samples} samples keep the margins and the {state} equation "
-                f"has {len(mine)} coefficients, more than {2 * len(mine)} are needed: use smaller "
+                f"{kept} of {so_many(samples, 'sample')} {'keeps' if kept == 1 else 'keep'} the "
+                f"margins "
+                f"and the {state} equation has {so_many(len(mine), 'coefficient')}, more than "
+                f"{2 * len(mine)} are needed: use smaller "
                 f"margins or a longer log."
             )
         solution = solved(row, mine)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 
+from greybox.errors import so_many
 from greybox.estimation.prediction_verdict import JudgedOn, seconds
 from greybox.estimation.tried import told
 from greybox.estimation.values import EstimateValues
@@ -92,7 +93,7 @@ def _structure(estimate: EstimateValues) -> str:
     structure = estimate.predictor.structure
     if len(structure.name) < _CELL:
         return f"structure '{structure.name}'"
-    return f"{len(structure.terms)} selected terms"
+    return so_many(len(structure.terms), "selected term")
 
 
 def estimated(estimate: EstimateValues) -> list[tuple[str, float, float, str]]:
@@ -119,14 +120,14 @@ def _wrapped(text: str, indent: str) -> list[str]:
 def _head(estimate: EstimateValues) -> list[str]:
     method = estimate.method + (", prefiltered" if estimate.prefilter == "noise" else "")
     structure = estimate.predictor.structure
-    name = structure.name
+    name, terms = structure.name, so_many(len(structure.terms), "term")
     rows = (
         ("Method:", method, "Samples:", f"{estimate.data.samples}"),
         ("Predictor:", estimate.predictor.kind, "Samples used:", f"{estimate.data.kept}"),
-        ("Structure:", name if len(name) < _CELL else f"{len(structure.terms)} terms (below)",
+        ("Structure:", name if len(name) < _CELL else f"{terms} (below)",
          "Sample time:", f"{estimate.sample_time:g} s"),
-        ("Std errors:", f"{estimate.covariance_kind}, {estimate.lags} lags", "Refinements:",
-         f"{estimate.iteration.count}"),
+        ("Std errors:", f"{estimate.covariance_kind}, {so_many(estimate.lags, 'lag')}",
+         "Refinements:", f"{estimate.iteration.count}"),
     )  # fmt: skip
     lines = [f"{a:<18}{b:<{_CELL}}{c:<18}{d}" for a, b, c, d in rows]
     if len(name) >= _CELL:

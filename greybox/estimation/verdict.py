@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from enum import Enum, StrEnum
 from typing import Any, ClassVar, Literal
 
+from greybox.errors import so_many
 from greybox.notebook import DisplayMixin, items
 
 # degrees of freedom of a variance from which on F is χ²
@@ -335,7 +336,8 @@ class MostlyUndetermined(Reason):
     def sentence(self) -> str:
         """Which."""
         return (
-            f"{len(self.parameters)} of {self.count} parameters are not determined "
+            f"{len(self.parameters)} of {so_many(self.count, 'parameter')} "
+            f"{'is' if len(self.parameters) == 1 else 'are'} not determined "
             f"({', '.join(self.parameters)})"
         )
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from greybox.errors import GreyboxError, LogError, VesselError
+from greybox.errors import GreyboxError, LogError, VesselError, so_many
 from greybox.fleet.differing import FEWEST
 from greybox.vessel.toml import load_vessel
 from greybox.vessel.vessel import Vessel
@@ -110,7 +110,8 @@ def require_ships(ships: Sequence[str], left_out: Sequence[LeftOut], folder: str
         " Each ship is a folder directly in it, with one vessel file (*.toml) and that ship's logs."
     )
     raise LogError(
-        f"'{folder}' has {len(ships)} ships{named} that can be used, and at least {FEWEST} are "
+        f"'{folder}' has {so_many(len(ships), 'ship')}{named} that can be used, and at least "
+        f"{FEWEST} are "
         f"needed to see how much ships of a class differ.{told} Use greybox estimate for each ship."
     )
 
@@ -118,7 +119,7 @@ def require_ships(ships: Sequence[str], left_out: Sequence[LeftOut], folder: str
 def _vessel(vessels: Sequence[Path], logs: Sequence[Path]) -> Vessel:
     if len(vessels) != 1:
         raise VesselError(
-            f"its folder has {len(vessels)} vessel files (*.toml): keep exactly 1 there."
+            f"its folder has {so_many(len(vessels), 'vessel file')} (*.toml): keep exactly 1 there."
         )
     if not logs:
         raise LogError("its folder has no logs (*.csv, *.parquet): put at least 1 there.")

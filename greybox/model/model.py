@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import GreyboxError, ModelFileError, suggestion
+from greybox.errors import GreyboxError, ModelFileError, so_many, suggestion
 from greybox.files import nearest_file, plain, write_json
 from greybox.model.disturbances import DisturbanceKind
 from greybox.model.noise import (
@@ -387,7 +387,8 @@ def model_from_dict(data: Any, source: str = "model") -> ManoeuvringModel:
         covariance = np.array(data["covariance"], float)
         if theta.shape != (len(terms),) or covariance.shape != (len(terms), len(terms)):
             raise ModelFileError(
-                f"'{source}' has {len(terms)} terms but {theta.size} parameters: "
+                f"'{source}' has {so_many(len(terms), 'term')} but "
+                f"{so_many(theta.size, 'parameter')}: "
                 f"estimate the model again."
             )
         if s["disturbance"] not in get_args(DisturbanceKind):

@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import StructureError
+from greybox.errors import StructureError, so_many
 from greybox.model.disturbances import CURRENT, WIND
 from greybox.model.predictor_kinds import PREDICTORS
 from greybox.model.spelling import atoms, spelled_expression, spellings
@@ -119,8 +119,9 @@ class Predictor(DisplayMixin):
         signs = ", ".join(f"{s} {_SIGNS.get(v, v)}" for s, v in self.regime)
         where = f", {signs}" if signs else ""
         return (
-            f"predictor '{self.kind}' of structure '{self.structure.name}': {len(self.columns)} "
-            f"regressors, {len(self.parameter_columns)} of them of parameters{where}"
+            f"predictor '{self.kind}' of structure '{self.structure.name}': "
+            f"{so_many(len(self.columns), 'regressor')}, {len(self.parameter_columns)} of them "
+            f"of parameters{where}"
         )
 
     def _parts(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from functools import cache, cached_property
 
 import casadi as ca
 
-from greybox.errors import StructureError, suggestion
+from greybox.errors import StructureError, so_many, suggestion
 from greybox.model.disturbances import SHOWN, DisturbanceKind, disturbance_names, disturbed_signals
 from greybox.model.terms import SIGNALS, Term, parse_term
 from greybox.notebook import DisplayMixin, items, text
@@ -201,7 +201,7 @@ class Structure(DisplayMixin):
 
     def _line(self) -> str:
         return (
-            f"structure '{self.name}': {len(self.terms)} terms in the equations of "
+            f"structure '{self.name}': {so_many(len(self.terms), 'term')} in the equations of "
             f"{', '.join(self.states)}"
         )
 
@@ -234,6 +234,6 @@ class Structure(DisplayMixin):
             if local:
                 of = dict.fromkeys(f.signal for t in local for f in t.factors)
                 arguments = ", ".join(shown.get(n, n) for n in of)
-                terms.append(f"g_{state}({arguments})  [{len(local)} bumps]")
+                terms.append(f"g_{state}({arguments})  [{so_many(len(local), 'bump')}]")
             lines.append(f"{state}⁺ = " + " + ".join(start + terms))
         return lines

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from greybox.errors import UsageError, suggestion
+from greybox.errors import UsageError, so_many, suggestion
 from greybox.model.model import ManoeuvringModel
 from greybox.prediction.helm import ROUNDED, Helm, bounds
 from greybox.prediction.result import Kind, Side
@@ -122,7 +122,8 @@ def check(kind: Kind, model: ManoeuvringModel, asked: Conditions) -> None:
         )
     if asked.draws < FEWEST_DRAWS:
         raise UsageError(
-            f"{asked.draws} draws are too few for limits of 95 %: ask for {FEWEST_DRAWS} or more."
+            f"{so_many(asked.draws, 'draw', 'is', 'are')} too few for limits of 95 %: ask for "
+            f"{FEWEST_DRAWS} or more."
         )
     if asked.speed is not None and asked.command:
         raise UsageError(

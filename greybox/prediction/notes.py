@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import so_many
 from greybox.estimation.prediction_verdict import PredictionLevel
 from greybox.estimation.verdict import TrustLevel
 from greybox.model.model import ManoeuvringModel
@@ -65,7 +66,9 @@ def run_notes(
     diverged = int(runs.diverged[1:].sum())
     if diverged:
         told.append(
-            f"{diverged} of {total} draws diverge, which is a defect of the model and nothing that "
+            f"{diverged} of {so_many(total, 'draw')} "
+            f"{'diverges' if diverged == 1 else 'diverge'}, which is a defect of the model and "
+            f"nothing that "
             f"the ship does; they count in no interval."
         )
     short = int(((runs.complete[1:] < 0) & ~runs.diverged[1:]).sum())
@@ -77,7 +80,8 @@ def run_notes(
     if short:
         worst = min((v for v in values.values() if v is not None), key=lambda v: v.reached)
         told.append(
-            f"{short} of {total} draws do not complete the manoeuvre within {longest:.3g} s; "
+            f"{short} of {so_many(total, 'draw')} {'does' if short == 1 else 'do'} not complete "
+            f"the manoeuvre within {longest:.3g} s; "
             f"intervals are of the draws that reach the quantity, {worst.reached} at least."
         )
     if instant := instant_orders(kind, model, helm):

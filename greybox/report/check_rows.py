@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from greybox.errors import so_many
 from greybox.report.figures import (
     BLACK,
     BLUE,
@@ -154,7 +155,7 @@ def missing_figure(finding: Finding, recording: Recording) -> Figure:
         inside = [x for x in spans if x[1] > low and x[0] < high]
         _shade(zoom, inside, "")
         count = max(b - a for a, b in found)
-        zoom.set_title(f"the longest: {count} sample{'s' * (count > 1)}", fontsize=9)
+        zoom.set_title(f"the longest: {so_many(count, 'sample')}", fontsize=9)
     _name(s, whole, zoom, along=along)
     return figure
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from greybox.errors import GreyboxError, UsageError
+from greybox.errors import GreyboxError, UsageError, so_many
 from greybox.report.chart import chart_of
 from greybox.report.check_answers import answer_figure, course_figure, wind_figure
 from greybox.report.check_inputs import actuator_figure, force_figure
@@ -174,7 +174,7 @@ def check_page(
 def headline(reports: Sequence[CheckReport]) -> str:
     """Return how much was found, and the most serious of it in words."""
     found = [(f, r) for r in reports for f in r.findings]
-    logs = f"{len(reports)} log" + "s" * (len(reports) != 1)
+    logs = so_many(len(reports), "log")
     if not found:
         open_ids = sorted({o.id for r in reports for o in r.outcomes if o.status == "cannot tell"})
         vague = f"; nothing can be said of {', '.join(open_ids)}" if open_ids else ""
@@ -183,7 +183,7 @@ def headline(reports: Sequence[CheckReport]) -> str:
     finding = min(report.findings, key=_seriousness)
     several = {f.key for f in shared_findings(reports)}
     each = sum(f.key not in several for f, _ in found) + len(several)
-    count = f"{each} finding" + "s" * (each != 1)
+    count = so_many(each, "finding")
     name = f"{len(finding.logs)} logs together" if finding.key in several else report.name
     where = f" ({name})" if len(reports) > 1 else ""
     lead = "the most serious" if each > 1 else "namely"

@@ -8,31 +8,20 @@ from typing import Any
 
 import numpy as np
 
+from greybox.channels import MOTION_WORDS
 from greybox.model.model import ManoeuvringModel
 from greybox.report.chart import chart_of
-from greybox.report.figures import comparison_figure, percent, to_svg, told_fits
+from greybox.report.error_budget import noise_sentence
+from greybox.report.figures import comparison_figure, to_svg
 from greybox.report.next_steps import after_comparison
-from greybox.report.page import Page, Picture, Table, computed
+from greybox.report.page import Page, Picture, Table, capital, computed
 from greybox.report.thinning import points_for
 from greybox.validation.bands import LEVEL, Bands
 from greybox.validation.comparison import Comparison, rmse_titles
-from greybox.validation.fit import LogFit, mean_fit
+from greybox.validation.fit import LogFit, mean_fit, percent, told_fits
 
 # with more the page grows and tells nothing new
 MOST_LOGS = 8
-
-
-def headline(comparison: Comparison) -> str:
-    """Return one sentence on which model fits best and how well."""
-    fits, best = comparison.fits(), comparison.best()
-    shown = told_fits(fits[best], 0)
-    count = len(comparison.runs[0])
-    logs = f"the {count} logs" if count > 1 else "the log"
-    most = " best" if len(fits) > 1 else ""
-    return (
-        f"The free run of model '{comparison.names[best]}' fits {logs}{most}: {shown} "
-        f"(100 is perfect)."
-    )
 
 
 def comparison_page(
@@ -68,6 +57,27 @@ def comparison_page(
             ahead_rows,
         ),
     ]
+    noise_rows = [
+        [
+            name, run.log.name, s, percent(run.fit[s]).removesuffix(" %"), f"{n.fit:.1f}",
+            f"{errors[s]:.3g}", f"{n.std:.2g}",
+        ]
+        for name, row, noises, rmse in zip(
+            comparison.names, comparison.runs, comparison.noise, comparison.rmse, strict=True
+        )
+        for run, noise, errors in zip(row, noises, rmse, strict=True)
+        for s, n in noise.items()
+    ]  # fmt: skip
+    if noise_rows:
+        tables.insert(
+            1,
+            Table(
+                "What sensor noise allows: the fit of a perfect model, and the error of noise "
+                "alone [m/s, rad/s]",
+                ["model", "log", "state", "fit [%]", "at most [%]", "error", "noise alone"],
+                noise_rows,
+            ),
+        )
     cover_rows = [
         [
             name,
@@ -104,11 +114,11 @@ def comparison_page(
         )
     return Page(
         title="Measured against simulated",
-        headline=headline(comparison),
+        headline=comparison.verdict.sentence,
         sentences=[
+            *_noise_sentences(comparison),
             *comparison.notes,
             *dict.fromkeys(g.sentence for row in comparison.runs for run in row for g in run.gaps),
-            *[t.sentence for t in tests],
             *[
                 f"{name}: {d.sentence}"
                 for name, differences in zip(comparison.names, comparison.conditions, strict=True)
@@ -119,13 +129,22 @@ def comparison_page(
         ],
         pictures=pictures,
         lead=lead,
-        next_steps=[after_comparison(comparison, models, record)],
+        next_steps=after_comparison(comparison, models, record),
         tables=tables,
         texts=[
             (f"Model {name}", model.summary())
             for name, model in zip(comparison.names, models, strict=True)
         ],
-        computed=computed(record) | {"start": "mean of the log's first 5 samples"},
+        computed=computed(record)
+        | {"start": "mean of the log's first 5 samples"}
+        | (
+            {
+                "intervals of differences": "95 %, of the mean fit over channels and logs, by "
+                "Student's t over eight stretches of each log (Ibragimov and Müller, 2010)"
+            }
+            if comparison.verdict.differences
+            else {}
+        ),
     )
 
 
@@ -179,6 +198,23 @@ def run_picture(
         for room in ({}, {"most": 10_000, "room": 120_000})
     )
     return Picture(to_svg(printed, key), caption, f"{caption} {told}", chart=chart_of(zoomed))
+
+
+def _noise_sentences(comparison: Comparison) -> list[str]:
+    """Return how much of the error of the best model is noise."""
+    verdict = comparison.verdict
+    if verdict.diverging:
+        return []
+    of = f" of '{verdict.best}'" if verdict.models > 1 else ""
+    still = [
+        f"{MOTION_WORDS.get(s, s)} hardly moved on {run.log.name} and tells little there."
+        for run, noise in zip(
+            comparison.runs[comparison.best()], comparison.noise[comparison.best()], strict=True
+        )
+        for s, n in noise.items()
+        if not n.moves
+    ]
+    return [*noise_sentence(verdict.shares, verdict.bounds, of), *map(capital, still)]
 
 
 def _left_out(comparison: Comparison) -> list[str]:

@@ -120,8 +120,9 @@ def _ranking(diagnosis: Diagnosis, kept: Sequence[str]) -> Iterator[Picture]:
         more = (
             f" The other {len(step) - len(shown)} are not drawn." if len(step) > len(shown) else ""
         )
+        held = "cannot tell apart" if diagnosis.candidates else "names"
         named = (
-            "Bold: the causes that the verdict names."
+            f"Bold: the causes that the verdict {held}."
             if any(r.key in kept for r in shown)
             else "The verdict names none of these."
         )

@@ -9,8 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from greybox.channels import CHANNELS, MOTION_WORDS
-from greybox.diagnosis.result import Diagnosis, Gain, Runs, hardly_split, is_split
-from greybox.estimation.prediction_verdict import LIMITS
+from greybox.diagnosis.result import Diagnosis, DiagnosisVerdict, Runs, hardly_split, is_split
 from greybox.report.chart import chart_of
 from greybox.report.diagnosed_causes import cause_section, probability
 from greybox.report.diagnosis_figures import (
@@ -18,6 +17,7 @@ from greybox.report.diagnosis_figures import (
     command_figure,
     gain_figure,
     heading_figure,
+    leaves_picture,
     most_followed,
     regime_figure,
     run_figure,
@@ -29,11 +29,11 @@ from greybox.report.error_budget import (
     budget_table,
     cut_off,
     largest,
-    noise_bounds,
     noise_sentence,
+    noise_shares,
     tells,
 )
-from greybox.report.figures import narrow, percent, told_fits
+from greybox.report.figures import narrow
 from greybox.report.free_run_errors import REGIMES, Errors, gather, simulations
 from greybox.report.model_difference import (
     coefficient_table,
@@ -43,15 +43,14 @@ from greybox.report.model_difference import (
 from greybox.report.next_steps import NextStep
 from greybox.report.page import Page, Picture, Section, Table, capital, computed
 from greybox.report.thinning import points_for
+from greybox.validation.comparison_verdict import use_sentence
+from greybox.validation.fit import fit_percent, mean_fit, percent
+from greybox.validation.gain import Gain
 
 # logs of each kind that are drawn: with more the page grows and tells nothing new
 _MOST_LOGS = 3
 # characters of a verdict that leave room for the next step on the first screen
 _LONGEST = 330
-# fit [%] with which the error is half of the spread: the limit of a good prediction
-_USABLE = 100 * (1 - LIMITS.good)
-# percent of fit below what noise allows that are as good as it
-_NEAR = 5.0
 
 
 def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
@@ -63,10 +62,14 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
     record : mapping
         How it was computed: versions, command, hashes of the logs, seed.
     """
+    if not _changed(diagnosis):
+        # parts that are predicted by fits to the others are no other model
+        alike = tuple(replace(run, after=run.before) for run in diagnosis.runs)
+        diagnosis = replace(diagnosis, runs=alike)
     wrong, gain = _wrong(diagnosis), gain_section(diagnosis)
     # whose the error is says most; without it, what was gained; without that, the run itself
     budget = list(_budget(diagnosis))
-    first = [*gain.pictures, *wrong.pictures[:1]]
+    first = [*gain.pictures, *wrong.pictures[_telling(diagnosis.runs) :][:1]]
     # a picture of shares that the logs do not tell is empty
     lead = next(iter([*budget, *first] if tells(diagnosis.budget) else [*first, *budget]), None)
     sections = [
@@ -100,8 +103,11 @@ def diagnosis_page(diagnosis: Diagnosis, record: Mapping[str, Any]) -> Page:
 
 def _headline(diagnosis: Diagnosis) -> str:
     """Return the verdict, causes by their titles alone where all of it would fill the screen."""
-    if len(diagnosis.causes) < 2 or len(diagnosis.headline) <= _LONGEST:
-        return diagnosis.headline
+    # why it is not only noise is enough here: what remains has a section of its own
+    first = diagnosis.remaining.split(". ")[0].rstrip(".")
+    told = diagnosis.headline.replace(diagnosis.remaining, f"{first}.")
+    if len(diagnosis.causes) < 2 or len(told) <= _LONGEST:
+        return told
     count = Counter(c.title for c in diagnosis.causes)
     titles = "; ".join(
         # causes of one title are told apart by what they estimate
@@ -114,19 +120,14 @@ def _headline(diagnosis: Diagnosis) -> str:
 
 def _use(diagnosis: Diagnosis) -> str:
     """Return whether the model predicts what it was not fitted to, beside what noise allows."""
-    after = {s: g.after for s, g in diagnosis.gain.items()}
-    if not after:
+    if not diagnosis.gain:
         return ""
-    bounds = {s: b for s, b in noise_bounds(diagnosis).items() if s in after}
-    # noise may hide a channel, which is no fault of the model
-    weak = [s for s, fit in after.items() if fit < min(_USABLE, bounds.get(s, 100.0) - _NEAR)]
-    which = "the extended model" if _changed(diagnosis) else "the model"
-    words = ", ".join(MOTION_WORDS.get(s, s) for s in weak)
-    told = f"Do not predict {words} with {which}" if weak else f"You can predict with {which}"
-    told += f": on data held out from the fit it has a fit of {told_fits(after, 0)}"
-    if bounds:
-        told += f"; sensor noise allows at most {told_fits(bounds, 0)}"
-    return f"{told}."
+    which = "the extended model" if diagnosis.extended else "the model"
+    if diagnosis.verdict == DiagnosisVerdict.CONFUSED:
+        held = ", ".join(diagnosis.model.record.get("causes", ())) or diagnosis.groups[0][0]
+        which = f"the model with {held}"
+    fit = diagnosis.held_out_fit
+    return use_sentence(which, "data held out from the fit", fit, diagnosis.noise_bounds())
 
 
 def _step(told: str) -> NextStep:
@@ -144,7 +145,7 @@ def _summary(diagnosis: Diagnosis) -> list[str]:
         )
         told.append(f"The fit of the free run (100 % is perfect) changes: {gains}.")
     if diagnosis.budget:
-        told.append(noise_sentence(diagnosis))
+        told += noise_sentence(noise_shares(diagnosis), diagnosis.noise_bounds())
     return told
 
 
@@ -162,7 +163,10 @@ def _remains(diagnosis: Diagnosis) -> Section:
 
 
 def _changed(diagnosis: Diagnosis) -> bool:
-    return any(g.before != g.after for g in diagnosis.gain.values())
+    """Whether there is another model to show: extended, or with coefficients that fit better."""
+    gains = diagnosis.gain.values()
+    found = diagnosis.verdict != DiagnosisVerdict.NONE and any(g.before != g.after for g in gains)
+    return diagnosis.extended or found
 
 
 def _wrong(diagnosis: Diagnosis) -> Section:
@@ -202,9 +206,12 @@ def _wrong(diagnosis: Diagnosis) -> Section:
 def _budget(diagnosis: Diagnosis) -> Iterator[Picture]:
     """Yield whose the squared error is."""
     if budget := budget_in_words(diagnosis):
-        caption = (
-            "Sources of the squared error of the held-out free run, before and after the model is "
-            "extended; the part of a cause is how much smaller the error would be without it."
+        caption = "Sources of the squared error of the held-out free run"
+        caption += (
+            ", before and after the model is extended; the part of a cause is how much smaller "
+            "the error would be without it."
+            if _changed(diagnosis)
+            else "."
         )
         if not all(is_split(p, state) for p in budget for state in p.share):
             caption += " Shares that the logs do not determine are not drawn."
@@ -212,7 +219,7 @@ def _budget(diagnosis: Diagnosis) -> Iterator[Picture]:
             caption += " Shares beyond the picture's edge stand in the table of the budget."
         caption += f" {told}" if (told := hardly_split(budget)) else ""
         told = f"{caption} Largest part of {largest(budget)}."
-        yield narrow(budget_figure(budget), "budget", caption, told)
+        yield narrow(budget_figure(budget, _changed(diagnosis)), "budget", caption, told)
 
 
 def _tests(diagnosis: Diagnosis, when: str) -> list[Table]:
@@ -272,6 +279,18 @@ def _drawn(runs: Sequence[Runs]) -> list[Runs]:
     return [r for kind in kinds for r in kind[:_MOST_LOGS]]
 
 
+def _telling(runs: Sequence[Runs]) -> int:
+    """Return which of the runs that are drawn is followed worst, of those held out if any are."""
+    drawn = _drawn(runs)
+    held = [i for i, run in enumerate(drawn) if run.held_out] or range(len(drawn))
+
+    def followed(i: int) -> float:
+        run = drawn[i]
+        return mean_fit({s: float(fit_percent(y, run.before[s])) for s, y in run.measured.items()})
+
+    return min(held, key=followed, default=0)
+
+
 def _run_pictures(runs: Sequence[Runs]) -> Iterator[Picture]:
     drawn = _drawn(runs)
     curves = sum(len(r.measured) * (1 + 2 * len(simulations(r))) for r in drawn)
@@ -284,6 +303,8 @@ def _run_pictures(runs: Sequence[Runs]) -> Iterator[Picture]:
             f"Free run on {run.log.name} ({kind}; {len(run.log)} samples of "
             f"{run.log.sample_time:g} s): {shown}; below, measured − simulated."
         )
+        if leaves_picture(run):
+            caption += " What leaves the picture is drawn at its edge."
         yield narrow(
             run_figure(run), f"run{i}", caption, f"{caption} {_rms_sentence(gather([run]))}",
             chart_of(run_figure(run, points)),
@@ -324,7 +345,7 @@ def gain_section(diagnosis: Diagnosis) -> Section:
     on = diagnosis.validated_on
     return Section(
         "4. The gain", [capital(on).rstrip(".") + "."] if on else [],
-        [gain_picture(diagnosis.gain, bounds=noise_bounds(diagnosis))]
+        [gain_picture(diagnosis.gain, bounds=diagnosis.noise_bounds())]
         if _changed(diagnosis) else [], tables,
     )  # fmt: skip
 
@@ -349,8 +370,8 @@ def _gain_table(caption: str, gain: Mapping[str, Gain], heads: tuple[str, str]) 
     rows = [
         [
             MOTION_WORDS.get(s, s), percent(g.before), percent(g.after),
-            f"{g.after - g.before:+.1f}" if percent(g.before) != "diverged" else "",
-            f"{g.ci[0]:.1f} to {g.ci[1]:.1f}",
+            *((f"{g.after - g.before:+.1f}", f"{g.ci[0]:.1f} to {g.ci[1]:.1f}")
+              if percent(g.before) != "diverged" else ("", "")),
         ]
         for s, g in gain.items()
     ]  # fmt: skip

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator, SymmetricalLogLocator
 from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS, MOTION_WORDS
-from greybox.diagnosis.result import Gain, Ranked, Runs
+from greybox.diagnosis.result import Ranked, Runs
 from greybox.report.error_profiles import Profile, profile
 from greybox.report.figures import (
     BLACK,
@@ -28,6 +28,7 @@ from greybox.report.figures import (
 from greybox.report.free_run_errors import REGIMES, Errors, simulated, simulations
 from greybox.report.thinning import find_gaps
 from greybox.validation.fit import LEFT
+from greybox.validation.gain import Gain
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -68,8 +69,7 @@ def run_figure(run: Runs, points: int = _POINTS) -> Figure:
     pairs = run_axes(figure, states, _SHORT, "error", 9)
     for state, (top, below) in zip(states, pairs, strict=True):
         measured = run.measured[state]
-        spread = float(np.ptp(measured)) or 1.0
-        low, high = measured.min() - 0.6 * spread, measured.max() + 0.6 * spread
+        spread, low, high = _room(measured)
         draw_line(top, t, measured, gaps, points, color=BLACK, linewidth=0.9, label="measured")
         for name in shown:
             style = {k: v for k, v in _STYLE[name].items() if k != "marker"}
@@ -80,6 +80,24 @@ def run_figure(run: Runs, points: int = _POINTS) -> Figure:
         below.axhline(0, color=BLACK, linewidth=0.6)
     _legend(figure, pairs[0][0])
     return figure
+
+
+def _room(measured: Array) -> tuple[float, float, float]:
+    """Return the spread of a signal, and the limits within which a simulation is drawn."""
+    spread = float(np.ptp(measured)) or 1.0
+    return spread, measured.min() - 0.6 * spread, measured.max() + 0.6 * spread
+
+
+def leaves_picture(run: Runs) -> bool:
+    """Whether a simulation goes further than it is drawn."""
+    for state, measured in run.measured.items():
+        spread, low, high = _room(measured)
+        for name in simulations(run):
+            x = simulated(run, name, state)
+            far = (x < low) | (x > high) | (np.abs(measured - x) > spread)
+            if far.any():
+                return True
+    return False
 
 
 def heading_figure(errors: Errors) -> Figure:

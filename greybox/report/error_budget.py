@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from textwrap import fill
 
@@ -18,10 +18,9 @@ from greybox.report.figures import (
     legend_outside,
     new_figure,
     tidy,
-    told_fits,
 )
 from greybox.report.page import Table
-from greybox.validation.fit import fit_percent
+from greybox.validation.fit import told_fits
 
 # inches: letters stay legible where the page is 390 px wide
 _WIDTH = 4.4
@@ -48,8 +47,8 @@ def budget_in_words(diagnosis: Diagnosis) -> list[BudgetPart]:
     return [replace(p, part=told.get(p.part, p.part)) for p in diagnosis.budget]
 
 
-def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
-    """Draw the shares that the logs tell with their intervals, and what is left of them after."""
+def budget_figure(budget: Sequence[BudgetPart], extended: bool = True) -> Figure:
+    """Draw the shares that the logs tell, and what is left of them where a model is extended."""
     states = list(budget[0].share)
     figure = new_figure(_WIDTH, 1.0 + 0.3 * len(budget))
     axes = figure.subplots(1, len(states), sharey=True, squeeze=False)[0]
@@ -58,12 +57,14 @@ def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
         told = [100.0 if is_split(p, state) else np.nan for p in budget]
         share = told * np.array([p.share[state] for p in budget])
         low, high = told * np.array([p.ci[state] for p in budget]).T
-        ax.barh(places, share, 0.72, color=BLUE, edgecolor="0.2", linewidth=0.6, label="before")
-        ax.barh(
-            places, told * np.array([p.after[state] for p in budget]), 0.3, color=ORANGE,
-            edgecolor="0.2", linewidth=0.6, label="after the extension",
-        )  # fmt: skip
-        ax.hlines(places, low, high, color="0.2", linewidth=1.0, label="95 % interval of before")
+        look = {"edgecolor": "0.2", "linewidth": 0.6}
+        before = "before" if extended else "share"
+        ax.barh(places, share, 0.72, color=BLUE, label=before, **look)
+        if extended:
+            left = told * np.array([p.after[state] for p in budget])
+            ax.barh(places, left, 0.3, color=ORANGE, label="after the extension", **look)
+        interval = f"95 % interval{' of before' * extended}"
+        ax.hlines(places, low, high, color="0.2", linewidth=1.0, label=interval)
         ax.axvline(0, color="0.2", linewidth=0.8)
         ax.set_xlim(*_SHOWN)
         ax.set_xticks([0, 100])
@@ -73,7 +74,8 @@ def budget_figure(budget: Sequence[BudgetPart]) -> Figure:
     names = [fill(p.part, _LETTERS, break_long_words=False) for p in budget]
     axes[0].set_yticks(places, names, fontsize=8.5)
     axes[0].set_ylim(len(budget) - 0.4, -0.6)
-    figure.supxlabel("share of the squared error before the extension [%]", fontsize=9)
+    when = " before the extension" * extended
+    figure.supxlabel(f"share of the squared error{when} [%]", fontsize=9)
     legend_outside(figure, axes[0], "upper left", 3, handlelength=1.4, columnspacing=1.0)
     return figure
 
@@ -113,48 +115,43 @@ def tells(budget: Sequence[BudgetPart]) -> bool:
 
 def noise_shares(diagnosis: Diagnosis) -> dict[str, float]:
     """Return the share that sensor noise has in the squared error that is left, by state."""
-    budget = diagnosis.budget
-    noise = next((p.after for p in budget if p.part == SENSOR), {})
+    sensor = next((p for p in diagnosis.budget if p.part == SENSOR), None)
+    if sensor is None:
+        return {}
+    left = {p.part: p.after if diagnosis.extended else p.share for p in diagnosis.budget}
     return {
-        state: min(max(own / max(sum(p.after[state] for p in budget), 1e-300), 0.0), 1.0)
-        for state, own in noise.items()
+        state: min(max(own / max(sum(of[state] for of in left.values()), 1e-300), 0.0), 1.0)
+        for state, own in left[SENSOR].items()
+        if is_split(sensor, state)
     }
 
 
-def noise_bounds(diagnosis: Diagnosis) -> dict[str, float]:
-    """Return the fit (6.12) [%] of a perfect model on the held-out logs, by state.
+def noise_sentence(
+    shares: Mapping[str, float], bounds: Mapping[str, float], of: str = " that is left"
+) -> list[str]:
+    """Return how much of the error that is left is noise, and the fit that noise alone allows.
 
-    Empty where the noise is not known, or nothing was held out.
+    Nothing where the logs do not tell.
     """
-    noise = diagnosis.model.noise
-    held = [run.measured for run in diagnosis.runs if run.held_out]
-    if noise is None or not held:
-        return {}
-    bounds = {}
-    for state, std in zip(noise.states, noise.measurement, strict=True):
-        if state not in held[0]:
-            continue
-        measured = np.concatenate([one[state] for one in held])
-        bounds[state] = max(float(fit_percent(measured, measured - float(std))), 0.0)
-    return bounds
-
-
-def noise_sentence(diagnosis: Diagnosis) -> str:
-    """Return how much of the error that is left is noise, and the fit that noise alone allows."""
-    shares = {s: 100 * share for s, share in noise_shares(diagnosis).items()}
-    bounds = {s: b for s, b in noise_bounds(diagnosis).items() if s in shares}
-    said = (
-        f"Sensor noise makes up this much of the squared error that is left: {told_fits(shares, 0)}"
-    )
+    if not shares:
+        return []
+    told = told_fits({s: 100 * share for s, share in shares.items()}, 0)
+    said = f"Sensor noise makes up this much of the squared error{of}: {told}"
+    bounds = {s: b for s, b in bounds.items() if s in shares}
     if bounds:
         said += (
             f". Measured with that noise, a perfect model would have a fit of about "
             f"{told_fits(bounds, 0)}"
         )
-    return f"{said}."
+    return [f"{said}."]
 
 
 def cut_off(budget: Sequence[BudgetPart]) -> bool:
     """Whether a share lies beyond what the picture shows."""
     low, high = _SHOWN
-    return any(not low <= 100 * share <= high for p in budget for share in p.share.values())
+    return any(
+        not low <= 100 * share <= high
+        for p in budget
+        for state, share in p.share.items()
+        if is_split(p, state)
+    )

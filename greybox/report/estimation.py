@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import MOTION_WORDS
+from greybox.errors import so_many
 from greybox.estimation.registry import ESTIMATORS
 from greybox.estimation.result import Estimate
 from greybox.estimation.summary import (
@@ -35,14 +36,14 @@ from greybox.report.estimation_figures import (
     tried_figure,
     visited_figure,
 )
-from greybox.report.figures import narrow, to_svg, told_fits
+from greybox.report.figures import narrow, to_svg
 from greybox.report.model_difference import shown_unit, unbroken
 from greybox.report.next_steps import after_estimate
 from greybox.report.page import Page, Picture, Section, Table, capital, computed
 from greybox.report.physical import physical_summary
 from greybox.selection.structures import StructureChoice
 from greybox.trial.log import TrialLog
-from greybox.validation.fit import mean_fit, run_model
+from greybox.validation.fit import mean_fit, run_model, told_fits
 
 Array = NDArray[np.float64]
 
@@ -137,12 +138,12 @@ def _summary(estimate: Estimate) -> list[str]:
     method = ESTIMATORS[estimate.method].description
     if estimate.prefilter == "noise":
         method += ", refined by the noise"
-    logs = len(estimate.logs)
     told = [
-        f"{len(estimate.names)} parameters of structure '{estimate.predictor.structure.name}' by "
+        f"{so_many(len(estimate.names), 'parameter')} of structure "
+        f"'{estimate.predictor.structure.name}' by "
         f"{method}, predictor '{estimate.predictor.kind}', from {estimate.kept} of "
-        f"{estimate.samples} samples of {estimate.sample_time:g} s in {logs} "
-        f"log{'s' * (logs != 1)}.",
+        f"{estimate.samples} samples of {estimate.sample_time:g} s in "
+        f"{so_many(len(estimate.logs), 'log')}.",
         # the headline has the others
         *(
             _sentence(r.sentence)

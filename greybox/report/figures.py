@@ -14,12 +14,11 @@ from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from greybox.channels import MOTION_WORDS
 from greybox.report.chart import Chart
 from greybox.report.page import Picture
 from greybox.report.thinning import find_gaps, pick, thin
 from greybox.validation.bands import Bands
-from greybox.validation.fit import LEFT, LogFit
+from greybox.validation.fit import LogFit, percent
 
 Array = NDArray[np.float64]
 
@@ -204,16 +203,6 @@ def comparison_figure(
     figure.align_ylabels()
     figure.suptitle(f"Free run on {shorten(log.name, 50)}", fontsize=10)
     return figure
-
-
-def percent(fit: float, digits: int = 1) -> str:
-    """Return a fit (6.12) [%] in words."""
-    return f"{fit:.{digits}f} %" if fit > LEFT else "diverged"
-
-
-def told_fits(fit: Mapping[str, float], digits: int = 1) -> str:
-    """Return the fit of each state in words."""
-    return ", ".join(f"{MOTION_WORDS.get(s, s)} {percent(v, digits)}" for s, v in fit.items())
 
 
 def legend_columns(labels: Sequence[str], width: float, most: int = 3) -> int:

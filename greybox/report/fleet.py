@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from greybox.errors import so_many
 from greybox.fleet.fleet import Fleet, ShipEstimate
 from greybox.fleet.pooling import LEVEL
 from greybox.fleet.trend import Trend
@@ -18,7 +19,6 @@ from greybox.report.figures import (
     BLUE,
     VERMILION,
     new_figure,
-    percent,
     shorten,
     tidy,
     to_svg,
@@ -26,6 +26,7 @@ from greybox.report.figures import (
 from greybox.report.model_difference import shown_unit, unbroken
 from greybox.report.next_steps import after_fleet
 from greybox.report.page import Page, Picture, Section, Table, capital, computed
+from greybox.validation.fit import percent
 
 Array = NDArray[np.float64]
 
@@ -232,8 +233,9 @@ def _time_section(fleet: Fleet) -> Section | None:
     ]
     told = [
         "A line is fitted to the estimates of each ship's periods; what differs from log to log "
-        f"without a trend widens its interval. Of {len(followed)} lines {len(changes)} rise or "
-        "fall beyond chance, adjusted for their number (Holm)."
+        f"without a trend widens its interval. Of {so_many(len(followed), 'line')} {len(changes)} "
+        f"{'rises or falls' if len(changes) == 1 else 'rise or fall'} beyond chance, adjusted "
+        f"for their number (Holm)."
     ]
     if not changes:
         told.append("The one that is nearest to a change is drawn.")

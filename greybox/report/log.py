@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator
 from numpy.typing import NDArray
 
+from greybox.errors import so_many
 from greybox.report.figures import (
     BLACK,
     COLOURS,
@@ -190,13 +191,13 @@ def _wind(log: TrialLog) -> Iterator[_Panel]:
 
 def _facts(log: TrialLog, clock: _Clock) -> str:
     found = [
-        f"{len(log)} samples of {log.sample_time:g} s",
+        f"{so_many(len(log), 'sample')} of {log.sample_time:g} s",
         f"{log.t[-1] - log.t[0]:.6g} s from t = {log.t[0]:.10g} s",
     ]
     gaps = clock.all_gaps
     if len(gaps):
         missing = float(np.sum(log.t[gaps + 1] - log.t[gaps] - log.sample_time))
-        found.append(f"{len(gaps)} gap{'s' * (len(gaps) > 1)}, {missing:.6g} s missing")
+        found.append(f"{so_many(len(gaps), 'gap')}, {missing:.6g} s missing")
     else:
         found.append("no gaps")
     if log.loop_known:

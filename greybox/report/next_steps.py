@@ -93,13 +93,7 @@ def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextSt
     short = max((log["samples"] for log in estimate.logs), default=SHORTEST) < SHORTEST
     doubtful = level in _DOUBTED or trust is TrustLevel.DO_NOT_TRUST
     if doubtful and short:
-        steps.append(
-            NextStep(
-                f"Sail a longer trial, since a diagnosis needs {SHORTEST} samples; plan it with "
-                f"this model",
-                f"greybox design --vessel {vessel} --model {model} --duration 900 --out plan.csv",
-            )
-        )
+        steps.append(_sail_longer(vessel, model))
     elif doubtful:
         held = f" --validate {validate}" if validate else ""
         held += "" if turns else f" --structure {shlex.quote(structure.name)}"
@@ -109,19 +103,8 @@ def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextSt
                 f"greybox diagnose {logs} --vessel {vessel}{held} --report diagnosis.html",
             )
         )
-    from greybox.prediction.helm import find_helm
-    from greybox.prediction.steady import kept_from_straight
-
-    helm = find_helm(estimate.vessel)
-    if level is PredictionLevel.GOOD and not (turns and helm.kind == "none"):
-        kind = "zigzag" if turns else "stopping"
-        free = " --no-limits" if turns and kept_from_straight(helm) else ""
-        steps.append(
-            NextStep(
-                "Predict manoeuvres of the ship",
-                f"greybox predict {model} {kind}{free} --report {kind}.html",
-            )
-        )
+    if level is PredictionLevel.GOOD:
+        steps += predict_step(model, estimate.vessel, turns)
     if level is PredictionLevel.NOT_JUDGED:
         steps.append(
             NextStep(
@@ -138,6 +121,33 @@ def after_estimate(estimate: Estimate, record: Mapping[str, Any]) -> list[NextSt
             )
         )
     return steps or [_use(model)]
+
+
+def _sail_longer(vessel: str, model: str) -> NextStep:
+    from greybox.diagnosis.preparing import SHORTEST
+
+    return NextStep(
+        f"Sail a longer trial, since a diagnosis needs {SHORTEST} samples; plan it with this model",
+        f"greybox design --vessel {vessel} --model {model} --duration 900 --out plan.csv",
+    )
+
+
+def predict_step(model: str, vessel: Vessel, turns: bool) -> list[NextStep]:
+    """Return the manoeuvre that a model predicts, of a ship that can be steered for it."""
+    from greybox.prediction.helm import find_helm
+    from greybox.prediction.steady import kept_from_straight
+
+    helm = find_helm(vessel)
+    if turns and helm.kind == "none":
+        return []
+    kind = "zigzag" if turns else "stopping"
+    free = " --no-limits" if turns and kept_from_straight(helm) else ""
+    return [
+        NextStep(
+            "Predict manoeuvres of the ship",
+            f"greybox predict {model} {kind}{free} --report {kind}.html",
+        )
+    ]
 
 
 def _use(model: str) -> NextStep:
@@ -203,19 +213,41 @@ def after_check(
 
 def after_comparison(
     comparison: Comparison, models: Sequence[ManoeuvringModel], record: Mapping[str, Any]
-) -> NextStep:
-    """Return the command that tells why the best model errs where it does."""
-    given = record.get("command", {}).get("models", ())
-    best = comparison.best()
-    model = shlex.quote(str(given[best])) if best < len(given) else "MODEL"
+) -> list[NextStep]:
+    """Return what the verdict asks for next, of the best model."""
+    given = [shlex.quote(str(path)) for path in record.get("command", {}).get("models", ())]
+    best, verdict = comparison.best(), comparison.verdict
+    name, model = verdict.best, given[best] if best < len(given) else "MODEL"
+    again = f"greybox compare {' '.join(given) or 'MODEL…'} --log LOG --report compare.html"
+    if verdict.in_sample:
+        logs = "a log that it was not" if len(models) == 1 else "a log that none of them was"
+        return [NextStep(f"Compare on {logs} estimated on", again)]
+    if verdict.untested:
+        return [NextStep("Compare on a log in which the ship moves more", again)]
     # a model that states no vessel file is of the same ship as those beside it
     stated = (typed(m.record.get("provenance", {}), "vessel", "") for m in (models[best], *models))
     vessel = next(filter(None, stated), "V")
-    return NextStep(
-        f"Find what '{comparison.names[best]}' gets wrong in these logs, and why",
-        f"greybox diagnose {typed(record, 'log', 'LOG…')} --vessel {vessel} --model {model} "
-        f"--report diagnosis.html",
+    logs = typed(record, "log", "LOG…")
+    fewer = fewer_terms(models[best])
+    if verdict.diverging and fewer:
+        return [NextStep(f"Estimate fewer terms than '{name}' has, and compare again", fewer)]
+    from greybox.diagnosis.preparing import SHORTEST
+
+    wrong = NextStep(
+        f"Find what '{name}' gets wrong in these logs, and why",
+        f"greybox diagnose {logs} --vessel {vessel} --model {model} --report diagnosis.html",
     )
+    if max(run.samples for run in comparison.runs[best]) < SHORTEST:
+        wrong = _sail_longer(vessel, model)
+    if verdict.diverging or verdict.weak:
+        return [wrong]
+    turns = "r" in models[best].structure.states
+    steps = predict_step(model, models[best].vessel, turns) or [_use(model)]
+    if verdict.rivals:
+        steps.append(NextStep("Tell these models apart on further logs", again))
+    elif verdict.beyond_noise:
+        steps.append(wrong)
+    return steps
 
 
 def _within_the_logs(made: ManoeuvrePrediction, model: str) -> list[NextStep]:

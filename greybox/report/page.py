@@ -223,6 +223,7 @@ del { background: #f9ddcc; }
   table { font-size: 0.8rem; } th, td { padding: 0.2rem 0.3rem; } th { white-space: normal; }
   td:first-child { position: sticky; left: 0; background: #fff; max-width: 8rem; } }
 @media print { button { display: none; } html { font-size: 11px; }
+  .lead figure > svg { max-height: 170mm; }
   figure > svg { max-width: 150mm; } body { max-width: none; font-size: 1rem; }
   figure { break-inside: avoid; }
   .pictures { grid-template-columns: 1fr 1fr; } h2, h3 { break-after: avoid; }
@@ -368,8 +369,12 @@ def flatten(record: dict[str, Any]) -> dict[str, str]:
             rows |= {f"{key} {k}": v for k, v in flatten(value).items()}
         elif isinstance(value, (list, tuple)):
             rows[key] = ", ".join(
-                " ".join(map(str, v.values())) if isinstance(v, dict) else str(v) for v in value
+                " ".join(map(str, v.values())) if isinstance(v, dict) else _short(v) for v in value
             )
         else:
-            rows[key] = str(value)
+            rows[key] = _short(value)
     return rows
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

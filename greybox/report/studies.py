@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from greybox.errors import so_many
 from greybox.files import make_folder, write_text
 from greybox.report.figures import (
     bias_figure,
@@ -225,14 +226,14 @@ def chapter7_output(result: Chapter7, record: dict[str, Any]) -> StudyOutput:
     mean = {(r.estimator, r.parameter): r for r in fit_rows}
     means = [mean[best, f"fit_{s}"].mean for s in result.states]
     headline = (
-        f"On {len(result.validation)} validation logs {best} fits best over {len(result.sets)} "
-        f"estimation sets: "
+        f"On {so_many(len(result.validation), 'validation log')} {best} fits best over "
+        f"{so_many(len(result.sets), 'estimation set')}: "
         + ", ".join(f"{s} {m:.0f} %" for s, m in zip(result.states, means, strict=True))
         + "."
     )
     lines = [
-        f"estimation sets: {len(result.sets)} of {len(result.sets[0])} logs; validation: "
-        + ", ".join(result.validation),
+        f"estimation sets: {len(result.sets)} of {so_many(len(result.sets[0]), 'log')}; "
+        f"validation: " + ", ".join(result.validation),
         f"{'estimator':<10}" + "".join(f"{'fit ' + s + ' [%]':>20}" for s in result.states),
     ]
     for name in result.fits:
@@ -241,7 +242,7 @@ def chapter7_output(result: Chapter7, record: dict[str, Any]) -> StudyOutput:
         lines.append(
             f"{name:<10}"
             + "".join(f"{r.mean:>11.1f} ± {r.sd:<6.1f}" for r in cells)
-            + (f"  diverged on {lost} of {len(result.sets)} sets" if lost else "")
+            + (f"  diverged on {lost} of {so_many(len(result.sets), 'set')}" if lost else "")
         )
     lines += [t.sentence for t in tests]
     lines += [f"{n} was left out: {why}" for n, why in result.skipped.items()]

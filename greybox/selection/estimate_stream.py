@@ -8,7 +8,7 @@ from typing import Any
 
 from greybox.credibility.assess import assess
 from greybox.credibility.judge import convergence, evidence_of
-from greybox.errors import UsageError
+from greybox.errors import UsageError, so_many
 from greybox.estimation.closed_loop import CLOSED_LOOP_LAG
 from greybox.estimation.problem import EstimationOptions, EstimationProblem, Fitted
 from greybox.estimation.refined import add_noise
@@ -155,7 +155,8 @@ def estimate_stream(
     notes += [*(n for n in first.notes if n != ended), *dropped, drawn.sentence]
     if streamed.sums.lost:
         notes.append(
-            f"{len(streamed.sums.lost)} segments take no part, since {streamed.sums.lost[0]}."
+            so_many(len(streamed.sums.lost), "segment", "takes", "take")
+            + f" no part, since {streamed.sums.lost[0]}."
         )
     estimate, diverged = with_runs(estimate, logs, notes)
     if request.judged:

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import ExcitationError
+from greybox.errors import ExcitationError, so_many
 from greybox.estimation.free_run import changes
 from greybox.estimation.innovations import ObservedRuns
 from greybox.estimation.output_setup import deviations, measured, output_model, output_predictor
@@ -220,7 +220,8 @@ class FreeRunSelection:
         at = self._fitted(self.runs, p, active)
         if not np.isfinite(at.cost):
             raise ExcitationError(
-                f"no free run of {len(active)} terms stays bounded on the {len(self.starts)} "
+                f"no free run of {so_many(len(active), 'term')} stays bounded on the "
+                f"{len(self.starts)} "
                 f"logs: use longer logs, or name a structure with --structure."
             )
         return active, at

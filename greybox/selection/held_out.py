@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import UsageError
+from greybox.errors import UsageError, so_many
 from greybox.trial.log import TrialLog
 from greybox.validation.fit import LogFit
 
@@ -148,7 +148,8 @@ def folds(logs: Sequence[TrialLog], count: int) -> list[tuple[list[TrialLog], li
     longest = max(logs, key=len)
     if len(longest) // count < _SHORTEST:
         raise UsageError(
-            f"'{longest.name}' has {len(longest)} samples and gives {count} parts of "
+            f"'{longest.name}' has {so_many(len(longest), 'sample')} and gives "
+            f"{so_many(count, 'part')} of "
             f"{len(longest) // count}, at least {_SHORTEST} samples are needed: use longer logs."
         )
     out = []

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import so_many
 from greybox.estimation.values import EstimationData
 from greybox.model.predictor import Predictor, build_predictor
 from greybox.model.structure import Structure
@@ -72,7 +73,8 @@ class Drawn:
     def part(self) -> str:
         """How many samples they hold, in words."""
         return (
-            f"{self.samples} of them ({100 * self.share:.3g} %) in {len(self.logs)} stretches, "
+            f"{self.samples} of them ({100 * self.share:.3g} %) in "
+            f"{so_many(len(self.logs), 'stretch')}, "
             f"those that tell the parameters apart best"
         )
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import ExcitationError, GreyboxError, OutOfTimeError, UsageError
+from greybox.errors import ExcitationError, GreyboxError, OutOfTimeError, UsageError, so_many
 from greybox.estimation.informative import ADVISED_HEADING, heading_range
 from greybox.model.catalogue import structure_for
 from greybox.model.predictor_kinds import PREDICTORS
@@ -237,7 +237,8 @@ def select_terms(
     whole, *paths = [[next(found_on) for _ in beginnings] for _ in of_parts]
     if not any(whole):
         raise ExcitationError(
-            f"no free run of selected terms stays bounded on the {len(logs)} logs: use longer "
+            f"no free run of selected terms stays bounded on the {so_many(len(logs), 'log')}: "
+            f"use longer "
             f"logs, or name a structure with --structure."
         )
     # runs on parts do not show that the path on all logs ended in a local minimum
@@ -322,7 +323,7 @@ def select_terms(
     )
     if left_out:
         said += (
-            f" {left_out} set{'s' if left_out > 1 else ''} preferred to it ran away with commands "
+            f" {so_many(left_out, 'set')} preferred to it ran away with commands "
             f"of the logs held constant."
         )
     if step != own:

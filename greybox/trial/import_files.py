@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.files import check_targets, real_path
 from greybox.trial.checks.actuators import measure_actuators
 from greybox.trial.checks.check import check_recordings
@@ -292,8 +292,8 @@ def _summary(
 ) -> str:
     return "\n".join(
         [
-            f"{first.provenance.source}: {samples} samples of {first.sample_time:g} s, "
-            f"{seconds:.6g} s, {segments} segment{'s' if segments > 1 else ''}",
+            f"{first.provenance.source}: {so_many(samples, 'sample')} of {first.sample_time:g} s, "
+            f"{seconds:.6g} s, {so_many(segments, 'segment')}",
             f"channels: {', '.join(first.channels)}",
             *lines,
         ]

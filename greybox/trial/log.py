@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from greybox.channels import CHANNELS, MOTIONS
-from greybox.errors import LogError, UsageError
+from greybox.errors import LogError, UsageError, so_many
 from greybox.notebook import DisplayMixin, items, number, sparkline, table
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.gaps import bridge
@@ -168,8 +168,8 @@ class TrialLog(DisplayMixin):
     def _line(self) -> str:
         span = f", t {self.t[0]:g} to {self.t[-1]:g} s" if len(self) else ""
         return (
-            f"log '{self.name}' of {self.vessel.name}: {len(self)} samples every "
-            f"{self.sample_time:g} s{span}, {len(self.channels)} channels"
+            f"log '{self.name}' of {self.vessel.name}: {so_many(len(self), 'sample')} every "
+            f"{self.sample_time:g} s{span}, {so_many(len(self.channels), 'channel')}"
         )
 
     def _rows(self) -> list[tuple[str, ...]]:

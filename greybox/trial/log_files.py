@@ -10,7 +10,7 @@ from glob import glob, has_magic
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from greybox.errors import GreyboxError, LogError, UsageError
+from greybox.errors import GreyboxError, LogError, UsageError, so_many
 
 # what the names of logs end in, for which a folder is searched: records and reports stand beside
 # them
@@ -93,8 +93,10 @@ def _found(path: str, names: list[str], within: str = "") -> list[LogFile]:
     logs = [n for n in sorted(names) if n.lower().endswith(ENDINGS) and not left(n)]
     if not logs:
         raise LogError(
-            f"'{path}' holds {len(names)} files and 0 of them end in {', '.join(ENDINGS)}, at "
-            f"least 1 is needed: name the folder that holds the logs."
+            f"'{path}' holds "
+            f"{so_many(len(names), 'file')}{', none of which ends' if names else ' that end'} "
+            f"in {', '.join(ENDINGS)}, and at least 1 is needed: name the folder that holds the "
+            f"logs."
         )
     return [LogFile(name, found=True) for name in logs]
 

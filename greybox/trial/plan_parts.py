@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import correlate
 
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.files import read_csv_rows
 from greybox.trial.convert.time_grid import MIN_SEGMENT
 from greybox.trial.log import TrialLog
@@ -202,7 +202,7 @@ def read_plan(path: str | Path, vessel: Vessel) -> tuple[PlannedTrial, ...]:
         steps = np.diff(values[:, 0])
         if len(own) < 2 or not (np.abs(steps - steps[0]) < 1e-6 * steps[0]).all():
             raise LogError(
-                f"the plan '{path.name}' has {len(own)} rows with steps of "
+                f"the plan '{path.name}' has {so_many(len(own), 'row')} with steps of "
                 f"{steps.min(initial=np.inf):g} to {steps.max(initial=0.0):g} s: its times must "
                 f"increase evenly, as greybox design writes them."
             )

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import so_many
 from greybox.notebook import DisplayMixin, items, number, sparkline, table
 from greybox.trial.steps import Step, on_zero
 from greybox.vessel.conditions import Conditions
@@ -52,7 +53,7 @@ class Signal:
         return len(self.t)
 
     def __repr__(self) -> str:
-        return f"<Signal: {self.name} [{self.unit or 'no unit'}], {len(self)} values>"
+        return f"<Signal: {self.name} [{self.unit or 'no unit'}], {so_many(len(self), 'value')}>"
 
     @property
     def known(self) -> Mask:
@@ -163,7 +164,7 @@ class Recording(DisplayMixin):
         spans = [s.t[np.isfinite(s.t)] for s in self.signals]
         spans = [t for t in spans if len(t)]
         long = max(t.max() for t in spans) - min(t.min() for t in spans) if spans else 0.0
-        return f"recording '{self.name}': {len(self.signals)} signals over {long:.6g} s"
+        return f"recording '{self.name}': {so_many(len(self.signals), 'signal')} over {long:.6g} s"
 
     def _rows(self) -> list[tuple[str, str, int, str, str, str, str, str]]:
         rows = []

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.trial.gaps import runs, split_at_gaps
 from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.trial.raw_log import Array
@@ -50,7 +50,8 @@ class Segment:
 
     def summary(self) -> str:
         """Return one line: what, when, how many samples."""
-        return f"{self.label}: {self.t_start:.1f} to {self.t_stop:.1f} s, {len(self)} samples"
+        held = so_many(len(self), "sample")
+        return f"{self.label}: {self.t_start:.1f} to {self.t_stop:.1f} s, {held}"
 
     def cut(self, log: TrialLog) -> TrialLog:
         """Return the samples of this segment as a log of their own."""
@@ -155,12 +156,13 @@ class LogGaps:
         )
         if not self.channels:
             return (
-                f"'{self.log}' has {self.count} gap{'s' * several} in which inputs or rows are "
+                f"'{self.log}' has {so_many(self.count, 'gap')} in which inputs or rows are "
                 f"missing, {where}: a run begins anew after {'each' if several else 'it'}."
             )
         return (
-            f"'{self.log}' lacks {', '.join(self.channels)} in {self.count} "
-            f"stretch{'es' * several} of {self.samples} samples in all, {where}: no fit counts "
+            f"'{self.log}' lacks {', '.join(self.channels)} in "
+            f"{so_many(self.count, 'stretch')} of {so_many(self.samples, 'sample')} in all, "
+            f"{where}: no fit counts "
             f"them, and a run goes on over them."
         )
 

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.rotation import ned_to_body
 from greybox.trial.raw_log import Array
 
@@ -168,13 +168,14 @@ def window_samples(
     if count < order + 2:
         odd = order + 2 + (order + 1) % 2
         raise LogError(
-            f"a window of {window_s:g} s holds {count} samples of {sample_time:g} s, order {order} "
+            f"a window of {window_s:g} s holds {so_many(count, 'sample')} of {sample_time:g} s, "
+            f"order {order} "
             f"needs {order + 2}: use a window of at least {(odd - 1) * sample_time:g} s."
         )
     if samples is not None and count > samples:
         longest = 2 * ((samples - 1) // 2) * sample_time
         raise LogError(
-            f"a window of {window_s:g} s holds {count} samples, the log has {samples}: "
+            f"a window of {window_s:g} s holds {so_many(count, 'sample')}, the log has {samples}: "
             f"use a window of at most {max(longest, 0.0):g} s."
         )
     return count

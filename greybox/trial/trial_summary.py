@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from greybox.errors import GreyboxError
+from greybox.errors import GreyboxError, so_many
 from greybox.notebook import DisplayMixin
 from greybox.trial.convert.convert import import_recording
 from greybox.trial.log import TrialLog
@@ -73,7 +73,7 @@ class Contents(DisplayMixin):
 
     def _line(self) -> str:
         count = len(self.manoeuvres)
-        return self.note or f"{count} manoeuvre{'s'[: count != 1]} in {self.seconds:g} s"
+        return self.note or f"{so_many(count, 'manoeuvre')} in {self.seconds:g} s"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents as plain values, angles in radians."""

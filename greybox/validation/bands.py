@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import so_many
 from greybox.model.model import ManoeuvringModel
 from greybox.model.run.inputs import LogInputs
 from greybox.model.run.simulation import simulate
@@ -109,7 +110,9 @@ class Bands:
         told = list(self.missing)
         if self.diverged:
             told.append(
-                f"{self.diverged} of {self.runs} draws of the parameters diverge and were left out"
+                f"{self.diverged} of {so_many(self.runs, 'draw')} of the parameters "
+                + ("diverges and was" if self.diverged == 1 else "diverge and were")
+                + " left out"
                 + (
                     ", too many for a band: estimate with --reduce, or on a longer log."
                     if np.isnan(self.motion).any()

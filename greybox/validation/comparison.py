@@ -20,7 +20,10 @@ from greybox.public import known_keywords
 from greybox.trial.log import Logs, TrialLog, as_list
 from greybox.trial.validity import ConditionDifference, other_conditions
 from greybox.validation.bands import LEVEL, Bands, predict_bands
+from greybox.validation.comparison_verdict import ComparisonVerdict, judge_comparison, mean_fits
 from greybox.validation.fit import LogFit, mean_fit, run_from, run_model
+from greybox.validation.gain import stretch_effects
+from greybox.validation.judge_prediction import HeldOut, NoiseBeside, noise_beside
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,6 +90,11 @@ class Comparison(DisplayMixin):
         for, or the run itself diverges.
     conditions : tuple of tuple of ConditionDifference
         One row a model: in what the logs differ from those it was estimated on.
+    noise : tuple of tuple of dict
+        What sensor noise leaves of the error, by state whose noise is known.
+    own : tuple of tuple of bool
+        Whether a model was estimated on a log.
+    verdict : ComparisonVerdict
     notes : tuple of str
         What to know of the logs.
     """
@@ -98,17 +106,18 @@ class Comparison(DisplayMixin):
     sign_tests: tuple[SignTest, ...]
     bands: tuple[tuple[Bands | None, ...], ...]
     conditions: tuple[tuple[ConditionDifference, ...], ...]
+    noise: tuple[tuple[dict[str, NoiseBeside], ...], ...]
+    own: tuple[tuple[bool, ...], ...]
+    verdict: ComparisonVerdict
     notes: tuple[str, ...] = ()
 
     def fits(self) -> list[dict[str, float]]:
         """Return the mean fit of each model [%]."""
-        return [
-            {s: float(np.mean([r.fit[s] for r in row])) for s in row[0].fit} for row in self.runs
-        ]
+        return [mean_fits(row) for row in self.runs]
 
     def best(self) -> int:
         """Return which model fits best, by the mean over the channels."""
-        return int(np.argmax([mean_fit(fit) for fit in self.fits()]))
+        return self.names.index(self.verdict.best)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison for JSON."""
@@ -127,15 +136,19 @@ class Comparison(DisplayMixin):
                             "rmse": rmse,
                             "ahead": ahead,
                             "diverged_at_sample": run.diverged if run.diverged >= 0 else None,
+                            "estimated_on": own,
+                            "noise": {n: vars(one) for n, one in noise.items()},
                             "band": {s: c.to_dict() for s, c in band.coverage.items()}
                             if band
                             else {},
                             "band_notes": list(band.notes) if band else [],
                         }
-                        for run, rmse, ahead, band in zip(row, errors, aheads, bands, strict=True)
+                        for run, rmse, ahead, band, own, noise in zip(
+                            row, errors, aheads, bands, mine, noises, strict=True
+                        )
                     ],
                 }
-                for name, fit, differences, row, errors, aheads, bands in zip(
+                for name, fit, differences, row, errors, aheads, bands, mine, noises in zip(
                     self.names,
                     self.fits(),
                     self.conditions,
@@ -143,6 +156,8 @@ class Comparison(DisplayMixin):
                     self.rmse,
                     self.ahead,
                     self.bands,
+                    self.own,
+                    self.noise,
                     strict=True,
                 )
             ],
@@ -158,6 +173,7 @@ class Comparison(DisplayMixin):
                 }
                 for t in self.sign_tests
             ],
+            "verdict": self.verdict.to_dict(),
             "start": "mean of the log's first 5 samples",
             "notes": list(self.notes),
         }
@@ -172,9 +188,10 @@ class Comparison(DisplayMixin):
         states = list(self.runs[0][0].fit)
         width, of_log = self._width, max(26, 1 + max(len(r.log.name) for r in self.runs[0]))
         lines = [
+            f"verdict: {self.verdict.sentence}",
             f"{'model':<{width}}{'log':<{of_log}}"
             + "".join(f"{'fit ' + s + ' [%]':>12}" for s in states)
-            + "".join(f"{title:>15}" for title in rmse_titles(states))
+            + "".join(f"{title:>15}" for title in rmse_titles(states)),
         ]
         for name, row, errors in zip(self.names, self.runs, self.rmse, strict=True):
             for run, rmse in zip(row, errors, strict=True):
@@ -442,6 +459,8 @@ class _Compared:
     rmse: dict[str, float]
     ahead: dict[str, dict[str, float]]
     band: Bands | None
+    noise: dict[str, NoiseBeside]
+    effects: Array
 
     def without_samples(self) -> _Compared:
         """Return what tables tell."""
@@ -466,7 +485,24 @@ def _compared(
         for i, s in enumerate(model.structure.states)
     }
     band = predict_bands(model, run.log, heading=heading, seed=seed) if bands and stays else None
-    return _Compared(run, rmse, errors_ahead(model, run, heading), band)
+    noise = noise_beside(HeldOut(model, run))
+    return _Compared(
+        run, rmse, errors_ahead(model, run, heading), band, noise, stretch_effects(run)
+    )
+
+
+def _estimated_on(model: ManoeuvringModel, log: TrialLog) -> bool:
+    used = {one["sha256"] for one in model.record.get("logs", ())}
+    return log.provenance.sha256 in used - {""}
+
+
+def _own_logs(name: str, own: Sequence[bool]) -> str:
+    """Return a sentence where logs are those that the model was estimated on, else ``""``."""
+    which = "these logs" if len(own) > 1 else "this log"
+    if not all(own):
+        which = f"{sum(own)} of {which[:5]} {len(own)} logs"
+    told = f"'{name}' was estimated on {which}: how it fits there says little of other logs."
+    return told if any(own) else ""
 
 
 def _to_keep(rows: Sequence[Sequence[_Compared]], most: int) -> set[int]:
@@ -517,9 +553,11 @@ def compare_each(
             f"table: compare those of the same states."
         )
     rows: list[list[_Compared]] = [[] for _ in models]
+    own: list[list[bool]] = [[] for _ in models]
     for logs in columns:
-        for model, log, row in zip(models, logs, rows, strict=True):
+        for model, log, row, mine in zip(models, logs, rows, own, strict=True):
             row.append(_compared(model, log, heading, bands, seed))
+            mine.append(_estimated_on(model, log))
         keep = set(range(len(rows[0]))) if whole is None else _to_keep(rows, whole)
         for row in rows:
             row[:] = [
@@ -527,6 +565,9 @@ def compare_each(
                 for k, one in enumerate(row)
             ]
     runs = tuple(tuple(one.run for one in row) for row in rows)
+    rmse = tuple(tuple(one.rmse for one in row) for row in rows)
+    noise = tuple(tuple(one.noise for one in row) for row in rows)
+    effects = [[one.effects for one in row] for row in rows]
     tests = [
         sign_test(name, names[0], s, [r.fit[s] for r in runs[0]], [r.fit[s] for r in row])
         for name, row in zip(names[1:], runs[1:], strict=True)
@@ -536,7 +577,7 @@ def compare_each(
     return Comparison(
         names,
         runs,
-        tuple(tuple(one.rmse for one in row) for row in rows),
+        rmse,
         tuple(tuple(one.ahead for one in row) for row in rows),
         tuple(tests),
         tuple(tuple(one.band for one in row) for row in rows),
@@ -544,4 +585,8 @@ def compare_each(
             other_conditions(model.conditions, [run.log for run in row])
             for model, row in zip(models, runs, strict=True)
         ),
+        noise,
+        tuple(map(tuple, own)),
+        judge_comparison(names, runs, rmse, noise, own, effects),
+        tuple(filter(None, (_own_logs(*one) for one in zip(names, own, strict=True)))),
     )

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.channels import CHANNELS
-from greybox.errors import LogError
+from greybox.channels import CHANNELS, MOTION_WORDS
+from greybox.errors import LogError, so_many
 from greybox.model.model import ManoeuvringModel
 from greybox.model.run.changes import Change
 from greybox.model.run.inputs import LogInputs
@@ -77,6 +77,21 @@ def fit_on(log: TrialLog, states: Sequence[str], x: Array) -> dict[str, float]:
         percent = fit_percent(log[state][known], x[known, i]) if known.any() else np.nan
         fit[state] = float(percent)
     return fit
+
+
+def noise_fit(measured: Array, std: float) -> float:
+    """Return the fit (6.12) [%] of a perfect model, measured with noise of a deviation; 0 least."""
+    return max(float(fit_percent(measured, measured - std)), 0.0)
+
+
+def percent(fit: float, digits: int = 1) -> str:
+    """Return a fit (6.12) [%] in words."""
+    return f"{fit:.{digits}f} %" if fit > LEFT else "diverged"
+
+
+def told_fits(fit: Mapping[str, float], digits: int = 1) -> str:
+    """Return the fit of each state in words."""
+    return ", ".join(f"{MOTION_WORDS.get(s, s)} {percent(v, digits)}" for s, v in fit.items())
 
 
 _log = logging.getLogger(__name__)
@@ -152,7 +167,7 @@ class LogFit(DisplayMixin):
 
     def _line(self) -> str:
         end = f", diverged at sample {self.diverged}" if self.diverged >= 0 else ""
-        return f"free run on '{self.log.name}', {len(self.log)} samples{end}"
+        return f"free run on '{self.log.name}', {so_many(len(self.log), 'sample')}{end}"
 
     def _rows(self) -> list[tuple[str, str, str, str]]:
         rows = []

@@ -32,7 +32,7 @@ from greybox.trial.segments import split_segments, whole_name
 from greybox.validation.bands import predict_bands
 from greybox.validation.calibration import RunErrors, cross_calibrated
 from greybox.validation.criteria import independent_samples
-from greybox.validation.fit import LogFit, run_from, run_model
+from greybox.validation.fit import LogFit, noise_fit, run_from, run_model
 
 Array = NDArray[np.float64]
 
@@ -65,6 +65,48 @@ class HeldOut:
     def of(cls, model: ManoeuvringModel, log: TrialLog, part: int = 0) -> HeldOut:
         """Run the model on a log."""
         return cls(model, run_model(model, log), part)
+
+
+@dataclass(frozen=True)
+class NoiseBeside:
+    """What the noise of a sensor leaves of a free run's error.
+
+    Parameters
+    ----------
+    std : float
+        Standard deviation of the noise [m/s, rad/s].
+    fit : float
+        Fit (6.12) that a perfect model would have [%].
+    moves : bool
+        Whether the channel moves by more than its noise, and enough to matter.
+    matters : bool
+        Whether it moves enough to matter, whatever its noise hides of that.
+    """
+
+    std: float
+    fit: float
+    moves: bool
+    matters: bool
+
+
+def noise_beside(held: HeldOut) -> dict[str, NoiseBeside]:
+    """Return what sensor noise leaves of the error of a run, by state whose noise is known."""
+    run, states = held.run, tuple(held.run.fit)
+    noise, (spread, _) = _noise([held], states), _errors([held], states)
+    moves, matters = (
+        _moves([run], states, spread, beside, held.model.vessel.length)
+        for beside in (noise, np.zeros(len(states)))
+    )
+    return {
+        s: NoiseBeside(
+            float(noise[i]),
+            noise_fit(run.log[s][run.log.known((s,))], noise[i]),
+            bool(moves[i]),
+            bool(matters[i]),
+        )
+        for i, s in enumerate(states)
+        if np.isfinite(noise[i]) and run.log.known((s,)).any()
+    }
 
 
 def judge_prediction(

@@ -10,7 +10,7 @@ from math import degrees, floor, inf, isfinite, radians
 from typing import Any, Literal, get_args
 
 from greybox.channels import CHANNELS
-from greybox.errors import VesselError, suggestion
+from greybox.errors import VesselError, so_many, suggestion
 from greybox.notebook import DisplayMixin, number, table
 from greybox.vessel.conditions import Conditions
 from greybox.vessel.thrust import ThrustLaw
@@ -468,7 +468,7 @@ class Vessel(DisplayMixin):
         """Return thrusters, limits and sensors as text."""
         mass = "" if self.mass is None else f", {self.mass:g} kg"
         count = len(self.thrusters)
-        lines = [f"{self.name}: {self.length:g} m{mass}, {count} thruster{'s'[: count != 1]}"]
+        lines = [f"{self.name}: {self.length:g} m{mass}, {so_many(count, 'thruster')}"]
         for t in self.thrusters:
             lines.append(
                 f"  {t.type} at x {t.x:g} m, y {t.y:g} m, moved by {', '.join(t.columns)}; "

@@ -22,6 +22,7 @@ from greybox.commands.diagnose import _where_antenna, _with_files, _with_model
 from greybox.commands.main import main
 from greybox.diagnosis.result import DiagnosisVerdict
 from greybox.diagnosis.ruling import _next
+from greybox.model.catalogue import get_structure
 from greybox.report.next_steps import after_comparison
 from greybox.trial.log import make_log
 from greybox.vessel.toml import load_vessel
@@ -64,7 +65,7 @@ def test_estimate_simulate_compare(tmp_path, capsys):
     compared = json.loads(result.read_text())
     assert [m["model"] for m in compared["models"]] == ["m", "ls"]
     assert set(compared["models"][0]["logs"][0]["fit"]) == {"u", "v", "r"}
-    assert "'m' was estimated on these logs: how it fits there" in capsys.readouterr().out
+    assert "'m' was estimated on this log: how it fits there" in capsys.readouterr().out
     raw = tmp_path / "raw.csv"
     raw.write_text("tvec,u\n0,1\n")
     assert run("simulate", model, raw, "--out", out) == 1
@@ -315,7 +316,7 @@ def test_reproduce_chapter7_on_logs(tmp_path, capsys):
     assert run("reproduce", "chapter7", "--vessel", "thesis", "--estimate", *files[:2],
                "--validate", files[2], "--runs", "5", "--out", tmp_path / "c7") == 0  # fmt: skip
     told = capsys.readouterr().out
-    assert "estimation sets: 2 of 1 logs" in told
+    assert "estimation sets: 2 of 1 log;" in told
     assert "note: --runs changed nothing" in told
     assert (tmp_path / "c7" / "table_7.1.png").exists()
 
@@ -383,6 +384,14 @@ def test_more_than_two_causes_are_told_apart_by_one_trial():
     assert "--model MODEL --for causes " in whole[0]
 
 
+def test_sensors_are_doubted_before_an_error_without_a_cause_is():
+    steps = _next(DiagnosisVerdict.UNEXPLAINED, [], False)
+    record = {"command": {"logs": ["a.csv"], "vessel": "ship.toml", "out": "m.json"}}
+    first, second = _with_files(steps, record)
+    assert first.endswith(": greybox check a.csv --vessel ship.toml --report check.html")
+    assert second.startswith("measure what the model does not know")
+
+
 def test_next_steps_name_the_files_of_the_user():
     steps = [
         "tell apart: greybox design --vessel V --between MODEL.a.json MODEL.b.json --out plan.csv",
@@ -398,9 +407,11 @@ def test_next_steps_name_the_files_of_the_user():
     assert "--between runs/better.a.json runs/better.b.json " in filled[0]
     assert "--model runs/better.json " in filled[1]
     assert len(filled) == 2
-    model = SimpleNamespace(record={"provenance": record})
-    best = SimpleNamespace(names=["mine"], best=lambda: 0)
-    step = after_comparison(
+    model = SimpleNamespace(record={"provenance": record}, structure=get_structure("thesis"))
+    verdict = SimpleNamespace(best="mine", in_sample=(), untested=False, diverging=None, weak=["u"])
+    runs = [[SimpleNamespace(samples=600)]]
+    best = SimpleNamespace(verdict=verdict, best=lambda: 0, runs=runs)
+    (step,) = after_comparison(
         best, [model], {"command": {"models": ["mine.json"], "log": ["day 2.csv"]}}
     )
     assert step.command == (
@@ -413,13 +424,24 @@ def test_after_a_diagnosis_both_models_are_compared_and_the_antenna_is_asked_for
     found = SimpleNamespace(
         id="inertia_coupling", evidence="or an antenna ahead, which looks alike"
     )
-    diagnosis = SimpleNamespace(causes=(found,), candidates=())
+    vessel = load_vessel("thesis")
+    model = SimpleNamespace(vessel=vessel, structure=get_structure("thesis"))
+    diagnosis = SimpleNamespace(causes=(found,), candidates=(), verdict="named", model=model)
     record = {"command": {"out": "mended.json", "validate": ["t3.csv"]}}
     compared, predicted = _with_model(diagnosis, record)
     assert compared.endswith(": greybox compare model.json mended.json --log t3.csv")
-    assert predicted.endswith(": greybox predict mended.json zigzag --report zigzag.html")
+    # the limits of this ship keep her from straight ahead
+    assert predicted.endswith(
+        ": greybox predict mended.json zigzag --no-limits --report zigzag.html"
+    )
     assert _with_model(diagnosis, {"command": {}}) == []
-    vessel = load_vessel("thesis")
+    none = SimpleNamespace(
+        verdict="none", model=model, held_out_fit={"u": 90.0}, noise_bounds=lambda: {"u": 96.0}
+    )
+    (told,) = _with_model(none, {"command": {"model": "mine.json"}})
+    assert "greybox predict mine.json zigzag" in told
+    none.held_out_fit["u"] = 20.0
+    assert _with_model(none, record) == []
     (asked,) = _where_antenna(diagnosis, replace(vessel, sensors={}))
     assert asked.endswith("state antenna = [x, y] in [sensors] of the vessel file, and repeat")
     assert _where_antenna(diagnosis, replace(vessel, sensors={"antenna": (1.0, 0.0)})) == []

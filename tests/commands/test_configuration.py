@@ -207,7 +207,7 @@ def test_what_is_wrong_is_told_in_one_sentence(folder, capsys, text, message):
     write(folder, text)
     given = ["estimate" if "check]" not in text else "check", "trial.csv"]
     if message is None:
-        given, message = ["design"], "between has 1 values, 2 are needed"
+        given, message = ["design"], "between has 1 value, 2 are needed"
     if "vessel" not in text:
         given += ["--vessel", "none.toml"]
     assert main(given) == 1

@@ -60,7 +60,7 @@ def test_a_run_is_of_one_log_of_a_folder(folder, tmp_path, capsys):
     model, out, few = tmp_path / "m.json", tmp_path / "run.csv", tmp_path / "few"
     main(["estimate", str(folder / "day0.csv"), *OPTIONS, "--out", str(model)])
     few.mkdir()
-    for said in ("holds 0 files and 0 of them end in .csv", "holds 3 logs, and one run is of 1"):
+    for said in ("holds 0 files that end in .csv", "holds 3 logs, and one run is of 1"):
         typed = few if " 0 " in said else folder
         assert main(["simulate", str(model), str(typed), "--out", str(out)]) == 1
         assert said in capsys.readouterr().err

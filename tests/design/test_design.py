@@ -623,7 +623,7 @@ def test_precision_of_a_given_plan():
     assert "−log det" in found.summary()
     with pytest.raises(UsageError, match="has 100 samples, the request 200"):
         predict_precision(request, [{k: v[:100] for k, v in plan.items()}])
-    with pytest.raises(UsageError, match="0 plans for 1 trials"):
+    with pytest.raises(UsageError, match="0 plans for 1 trial: "):
         predict_precision(request, [])
 
 

@@ -16,7 +16,7 @@ from greybox.commands.common import provenance
 from greybox.diagnosis.black_box import _reason, bump_terms, extended_by, fit_black_box, wider
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.extension import extended_model
-from greybox.diagnosis.gain import run_on
+from greybox.diagnosis.null_model import run_on
 from greybox.diagnosis.preparing import prepare
 from greybox.diagnosis.result import Diagnosis, Gain, Remainder
 from greybox.model.model import load_model

@@ -14,7 +14,7 @@ from schemas import schema
 from greybox.commands.main import main
 from greybox.diagnosis.builder import diverging
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
-from greybox.diagnosis.gain import block_sums, blocks, gains, run_on
+from greybox.diagnosis.null_model import run_on
 from greybox.diagnosis.preparing import _chosen
 from greybox.errors import LogError, UsageError
 from greybox.model.catalogue import get_structure
@@ -22,6 +22,7 @@ from greybox.model.model import ManoeuvringModel, load_model
 from greybox.selection.prediction import require_others
 from greybox.study.blind import Trial, draw, write
 from greybox.study.chapter6 import TRUE
+from greybox.validation.gain import block_sums, blocks, gains
 
 
 def _draw(seed: int, *effects: str, **conditions) -> Trial:

@@ -9,7 +9,7 @@ import pytest
 
 from greybox.diagnosis.assumed_causes import fit_given
 from greybox.diagnosis.diagnose import diagnose
-from greybox.diagnosis.gain import run_on
+from greybox.diagnosis.null_model import run_on
 from greybox.study.blind import draw
 
 

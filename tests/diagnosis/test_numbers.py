@@ -15,15 +15,15 @@ from greybox.diagnosis.builder import kept_without_name
 from greybox.diagnosis.causes import known_causes
 from greybox.diagnosis.diagnose import DiagnosisOptions, diagnose
 from greybox.diagnosis.evidence.held_out import proof_of
-from greybox.diagnosis.gain import gains
 from greybox.diagnosis.hypothesis import Hypothesis, Parameter
 from greybox.diagnosis.preparing import context_of, prepare
-from greybox.diagnosis.result import Found, Gain, Quantity, _gain_lines
+from greybox.diagnosis.result import Found, Quantity, _gain_lines
 from greybox.diagnosis.search import Candidate, _beside_others, _of_the_ship, freed, search
 from greybox.model.terms import mirror_sign, parse_term
 from greybox.study.blind import draw
 from greybox.trial.segments import join_segments, split_segments
 from greybox.validation.fit import average_fit, run_model
+from greybox.validation.gain import Gain, gains
 
 
 @pytest.fixture(scope="module")

@@ -98,7 +98,7 @@ def test_bumps_are_pure_numbers_and_one_line_of_the_equations(model: Manoeuvring
     assert parameter_unit(Term("X_g1", "u", (BUMP, Factor("u")))) == parameter_unit(
         Term("X_g2", "u", (Factor("u"),))
     )
-    assert model.structure.equations()[0].endswith(" + g_u(u_r, v_r, taux)  [1 bumps]")
+    assert model.structure.equations()[0].endswith(" + g_u(u_r, v_r, taux)  [1 bump]")
     assert "X_g1" not in model.summary()
     assert "g_u at most" in model.summary()
     assert "X_g1" not in to_prime({"X_g1": 1.0, "Xu": 1.0}, model.structure, length=1, speed=1)

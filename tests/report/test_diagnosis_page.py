@@ -11,16 +11,7 @@ import pytest
 from browser import needs_browser, require_legible, without_scripts
 from virtual import PARAMETERS, virtual_log
 
-from greybox.diagnosis.result import (
-    BudgetPart,
-    Diagnosis,
-    Found,
-    Gain,
-    Quantity,
-    Ranked,
-    Runs,
-    Symptom,
-)
+from greybox.diagnosis.result import BudgetPart, Diagnosis, Found, Quantity, Ranked, Runs, Symptom
 from greybox.model.catalogue import get_structure
 from greybox.model.model import ManoeuvringModel
 from greybox.model.noise import NoiseLevels
@@ -40,6 +31,7 @@ from greybox.report.model_difference import (
 from greybox.report.page import render, write_page
 from greybox.study.chapter6 import TRUE
 from greybox.validation.fit import run_model
+from greybox.validation.gain import Gain
 from greybox.vessel.toml import load_vessel
 from greybox.vessel.vessel import Actuation
 
@@ -270,6 +262,54 @@ def test_whose_the_error_is_stands_in_bars_and_numbers(told):
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_a_model_that_lacks_nothing_is_judged_as_it_is():
+    """Coefficients estimated again without a part of the logs are no other model."""
+    given = diagnosis_of("none")
+    runs = [replace(run, after={s: 0.9 * x for s, x in run.after.items()}) for run in given.runs]
+    gain = {s: Gain(66.0, fit, (-40.0, -20.0)) for s, fit in zip("uvr", (30, 31, 32), strict=True)}
+    page = diagnosis_page(replace(given, runs=tuple(runs), gain=gain, budget=BUDGET), RECORD)
+    assert page.headline == (
+        "Nothing is wrong beyond noise. You can predict with the model: on data held out from the "
+        "fit it has a fit of surge 66 %, sway 66 %, yaw rate 66 %."
+    )
+    pictures = [page.lead, *(p for s in page.sections for p in s.pictures)]
+    assert not any("after" in p.caption for p in pictures)
+    assert "changes" not in " ".join(page.sentences)
+    # 0.1 of all, not of what an extension leaves
+    assert "that is left: surge 10 %, sway 10 %, yaw rate 10 %" in " ".join(page.sentences)
+    assert len(budget_figure(BUDGET, False).axes[0].containers) == 1
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_what_is_wrong_is_shown_where_the_model_was_not_fitted():
+    still = replace(diagnosis_of("none"), verdict="unexplained", remaining="Why: a, b. More of it.")
+    page = diagnosis_page(still, RECORD)
+    assert "held out from the fit" in page.lead.caption
+    assert "estimated on" in page.sections[0].pictures[0].caption
+    # why is enough for the first screen
+    assert "explains it. Why: a, b. Do not predict" in page.headline
+    first, other = still.runs
+    late = np.arange(len(other.log)) > 500
+    far = {s: x + 2 * np.ptp(x) * late for s, x in other.before.items()}
+    away = replace(still, runs=(first, replace(other, before=far, after=far)))
+    told = "What leaves the picture is drawn at its edge."
+    assert told in diagnosis_page(away, RECORD).lead.caption
+    assert told not in diagnosis_page(away, RECORD).sections[0].pictures[0].caption
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_noise_allows_what_it_does_about_the_mean_of_each_log():
+    noise = NoiseLevels(("u", "v", "r"), np.full(3, 0.014), np.zeros(3), 0.0, 0.0, "test")
+    named = diagnosis_of("named")
+    held = named.runs[1]
+    faster = replace(held, measured={s: y + 5.0 for s, y in held.measured.items()},
+                     log=replace(held.log, name="day 3"))  # fmt: skip
+    named = replace(named, model=replace(named.model, noise=noise), runs=(held, faster))
+    want = 100 * (1 - 0.014 / held.measured["u"].std())
+    assert named.noise_bounds()["u"] == pytest.approx(want)
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_causes_of_the_budget_have_their_titles():
     own = replace(CURRENT, id="thruster_lag:n", key="thruster_lag:n", title="slow thrusters")
     other = replace(own, id="thruster_lag:alpha1", key="thruster_lag:alpha1")
@@ -331,6 +371,17 @@ def test_confused(told):
     assert "sway from diverged to 79.3 %" in shown
     assert "drawn at the edge" in shown
     assert "A run that diverged has no interval." in shown
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_first_of_what_cannot_be_told_apart_is_judged(pages):
+    assert "You can predict with the model with current: on data" in pages["confused"].headline
+    assert "cannot tell apart." in pages["confused"].sections[1].pictures[0].caption
+    # a run that diverged has no interval, in words as in numbers
+    rows = pages["confused"].sections[3].tables[0].rows
+    assert [row[3:] for row in rows if row[1] == "diverged"] == [["", ""]]
+    several = replace(diagnosis_of("confused"), groups=(("a", "b"), ("c", "d")))
+    assert several.headline.endswith("cause it is: a or b; c or d.")
 
 
 def test_a_gain_is_drawn_up_to_a_perfect_fit():

@@ -18,7 +18,6 @@ from virtual import PARAMETERS, virtual_log
 from experiment_design.demo.page import demo_page
 from experiment_design.demo.steps import Demo, Files, Step
 from experiment_design.output.report import design_page
-from greybox.diagnosis.result import Gain
 from greybox.model.catalogue import get_structure
 from greybox.prediction.predict import predict_manoeuvre
 from greybox.report.checks import check_page
@@ -32,6 +31,7 @@ from greybox.selection.estimate import estimate_model
 from greybox.study.blind_causes import Effect
 from greybox.study.chapter6 import TRUE
 from greybox.validation.comparison import compare
+from greybox.validation.gain import Gain
 from greybox.vessel.toml import load_vessel
 
 PAGES = ("estimate", "compare", "check", "predict", "design", "diagnose", "demo", "fleet")

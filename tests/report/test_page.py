@@ -84,6 +84,13 @@ def test_comparison_figure_has_labels_and_units(clean_log, thesis, true_theta):
     assert figure.axes[-1].get_xlabel() == "time from the first sample [s]"
 
 
+def page_of_noise(page):
+    """The rows of a comparison's table of noise: model, log and state."""
+    table = page.tables[1]
+    assert table.caption.startswith("What sensor noise allows")
+    return [row[:3] for row in table.rows]
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_a_comparison_tells_of_gaps_and_of_runs_that_left(clean_log, thesis, true_theta):
     from greybox.model.model import ManoeuvringModel
@@ -96,10 +103,15 @@ def test_a_comparison_tells_of_gaps_and_of_runs_that_left(clean_log, thesis, tru
     found = compare({"m": model}, log, bands=False)
     told = comparison_page(found, [model], {}).sentences
     assert [s for s in told if "a run begins anew after it" in s]
+    # a model without noise on a log without noise
+    assert page_of_noise(comparison_page(found, [model], {})) == [["m", "two", s] for s in "uvr"]
     (run,) = found.runs[0]
-    left = replace(found, runs=((replace(run, fit={"u": -2320.0, "v": -np.inf, "r": -261.4}),),))
+    fit = {"u": -2320.0, "v": -np.inf, "r": -261.4}
+    verdict = replace(found.verdict, fit=fit)
+    left = replace(found, runs=((replace(run, fit=fit),),), verdict=verdict)
     page = comparison_page(left, [model], {})
-    assert ": surge diverged, sway diverged, yaw rate -261 % (100" in page.headline
+    assert "Do not predict surge, sway, yaw rate with 'm'" in page.headline
+    assert "it has a fit of yaw rate -261 % and its run of surge, sway diverges" in page.headline
     assert page.tables[0].rows[0][2:5] == ["diverged", "diverged", "-261.4"]
     assert page.lead.alternative.endswith("m surge diverged, sway diverged, yaw rate -261.4 %.")
 

@@ -82,7 +82,7 @@ def test_parts_without_which_there_is_no_estimate_are_told(estimate, logs):
     found = with_prediction(estimate, logs, Request(), Refit(refuse)).prediction
     assert found.level is PredictionLevel.GOOD
     assert found.parts == 3
-    assert "1 of 4 parts were not judged" in found.reasons[-1]
+    assert "1 of 4 parts was not judged" in found.reasons[-1]
     assert "nothing turns" in found.reasons[-1]
 
     def never(_):

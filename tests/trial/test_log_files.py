@@ -52,7 +52,7 @@ def test_an_address_is_copied_for_as_long_as_it_is_read(folder: Path) -> None:
 def test_what_holds_no_log_says_how_many_files_it_holds(folder: Path) -> None:
     for name in ("b.csv", "a.parquet", "day/c.PQ"):
         (folder / name).unlink()
-    with pytest.raises(LogError, match=r"holds 3 files and 0 of them end in \.csv"):
+    with pytest.raises(LogError, match=r"holds 3 files, none of which ends in \.csv"):
         find_logs([str(folder)])
 
 

@@ -625,7 +625,7 @@ def test_misuse_is_told(turn_run):
     run = sampled(turn_run, 1.0)
     with pytest.raises(LogError, match="starts at 900 s but the log runs from 0 to"):
         measure_turning_circle(*arrays(run), start=900, length=LENGTH)
-    with pytest.raises(LogError, match="at least 2 executes, 1 were given"):
+    with pytest.raises(LogError, match="at least 2 executes, 1 was given"):
         measure_zigzag(*arrays(run), executes=[60.0], rudder=0.3, length=LENGTH)
     with pytest.raises(LogError, match="give times in this order"):
         measure_zigzag(*arrays(run), executes=[60.0, 900.0], rudder=0.3, length=LENGTH)

@@ -113,7 +113,7 @@ def test_plans_are_read_as_they_are_written(tmp_path):
         ("t,n\n0,1\n", "no column alpha1, alpha2: it has t, n"),
         ("t,n,alpha1,alpha2\n0,x,1,1\n1,1,1,1\n", "no number"),
         ("t,n,alpha1,alpha2\n0,1,1,1\n1,1,1,1\n5,1,1,1\n", "steps of 1 to 4 s"),
-        ("t,n,alpha1,alpha2\n0,1,1,1\n", "has 1 rows"),
+        ("t,n,alpha1,alpha2\n0,1,1,1\n", "has 1 row "),
         ("t,n,alpha1,alpha2\n", "has no rows"),
         ("t,part,n,alpha1,alpha2\n0,rest,1,1,1\n1,rest,1,1,1\n", "the part 'rest'"),
         (None, "cannot read the plan"),

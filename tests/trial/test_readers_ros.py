@@ -325,8 +325,8 @@ def test_fixes_without_a_fix_are_counted_and_left_out(tmp_path):
     recording = read_bag(ros2(tmp_path / "b", rows))
     np.testing.assert_array_equal(recording["lat"].value, [59.0, 60.0])
     np.testing.assert_allclose(recording["lat"].t, [0.0, 3.0])
-    assert any("1 messages were skipped: they have no fix" in n for n in recording.notes)
-    assert any("1 messages were skipped: they hold no position" in n for n in recording.notes)
+    assert any("1 message was skipped: they have no fix" in n for n in recording.notes)
+    assert any("1 message was skipped: they hold no position" in n for n in recording.notes)
 
 
 @pytest.mark.parametrize("store", [ROS1, ROS2])

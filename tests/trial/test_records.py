@@ -63,7 +63,7 @@ OLD = {
     "mended": (
         [],
         [
-            "nan of n: 1 of 601 samples of n hold no number, in 1 stretch, first at t = 25 s",
+            "nan of n: 1 of 601 samples of n holds no number, in 1 stretch, first at t = 25 s",
             "sign of r: r is reversed: only so do heading and the other channels agree "
             "(log-likelihood higher by 470)",
             "lever_arm of x_n, y_n: the positions are those of a point +5.99 m forward and "

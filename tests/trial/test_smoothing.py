@@ -122,7 +122,7 @@ def test_a_window_that_binary_numbers_miss_by_a_hair():
             r"holds 3 samples of 0\.1 s, order 2 needs 4: use a window of at least 0\.4 s",
         ),
         (lambda x: smooth(x, TS, 0.4, 4), r"order 4 needs 6: use a window of at least 0\.6 s"),
-        (lambda x: smooth(x, TS, 0.0, 1), r"holds 1 samples .* at least 0\.2 s"),
+        (lambda x: smooth(x, TS, 0.0, 1), r"holds 1 sample .* at least 0\.2 s"),
         (
             lambda x: savgol_velocities(x, x, x, TS, 9.0, 2),
             r"holds 91 samples, the log has 20: use a window of at most 1\.8 s",

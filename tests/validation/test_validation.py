@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from virtual import virtual_log
 
 from greybox.errors import (
@@ -30,11 +31,13 @@ from greybox.model.conversion import (
 )
 from greybox.model.model import load_model, model_from_dict
 from greybox.model.predictor import build_predictor
+from greybox.report.next_steps import after_comparison
 from greybox.selection.estimate import estimate_model
 from greybox.selection.fit_single import estimate_iv, estimate_ls
 from greybox.trial.log import make_log
 from greybox.validation.comparison import compare, compare_each, sign_test
-from greybox.validation.fit import fit_percent, run_model
+from greybox.validation.fit import LogFit, fit_on, fit_percent, mean_fit, run_model
+from greybox.validation.gain import gain_over_stretches, stretch_effects
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +89,7 @@ def test_models_survive_their_file(thesis_model, tmp_path):
     [
         ({"format": "x"}, "is not a model file"),
         ({"version": 99}, "has version 99"),
-        ({"theta": [1.0]}, "15 terms but 1 parameters"),
+        ({"theta": [1.0]}, "15 terms but 1 parameter:"),
         (
             {"disturbance_covariance": [[1.0]]},
             r"15 parameters and 0 disturbances, but a covariance between them of shape \(1, 1\)",
@@ -128,7 +131,8 @@ def test_comparison_tells_models_apart(thesis_model, clean_log, noisy_log):
 def test_long_names_stay_apart_in_the_summary(thesis_model, clean_log):
     log = replace(clean_log, name="zig-zag to starboard, 17 May, run 2")
     names = [f"campaigns/2024-05-17/{run}/model.json" for run in "ab"]
-    lines = compare(dict.fromkeys(names, thesis_model), [log], bands=False).summary().splitlines()
+    found = compare(dict.fromkeys(names, thesis_model), [log], bands=False)
+    _, *lines = found.summary().splitlines()
     assert lines[0].index("log") == len(names[0]) + 1
     for name in names:
         assert sum(line.startswith(f"{name} {log.name} ") for line in lines) == 1
@@ -145,6 +149,136 @@ def test_only_tables_are_kept_of_logs_that_are_not_drawn(thesis_model, noisy_log
         assert sum(len(run.log) for run in found.runs[0]) <= 300 * kept + 2 * 3
         assert found.to_dict() == whole.to_dict()
         assert found.summary() == whole.summary()
+
+
+@pytest.fixture(scope="module")
+def logged(thesis_model):
+    """A log of the model itself with noise of 0.01, and one as a file that it was estimated on."""
+    log = virtual_log(5, 600, wind=0.0, current=(0.0, 0.0), noise=0.0, spread=0.0)
+    x, rng = run_model(thesis_model, log).x, np.random.default_rng(0)
+    noisy = {s: x[:, i] + 0.01 * rng.standard_normal(600) for i, s in enumerate("uvr")}
+    log = replace(log, name="sailed", channels={**log.channels, **noisy})
+    known = replace(log, provenance=replace(log.provenance, sha256="a1"))
+    return log, known
+
+
+def test_a_model_that_follows_to_within_noise_is_to_be_used(thesis_model, logged):
+    found = compare({"m": thesis_model}, logged[0], bands=False)
+    told, (step,) = found.verdict, after_comparison(found, [thesis_model], {})
+    assert found.summary().startswith(f"verdict: {told.sentence}\nmodel ")
+    assert told.sentence.startswith("You can predict with 'm': on this log it has a fit of surge")
+    assert not told.beyond_noise
+    assert "greybox predict MODEL zigzag" in step.command
+    # beside the noise there is the start, a mean of samples in which the ship turned
+    assert 0.5 < min(told.shares.values()) <= max(told.shares.values()) <= 1.0
+    for s, bound in told.bounds.items():
+        measured = logged[0][s]
+        assert bound == pytest.approx(100 * (1 - 0.01 / measured.std()), rel=0.05)
+        assert bound - 5 < told.fit[s] < bound + 1
+    json.dumps(found.to_dict())
+
+
+def test_of_models_the_better_one_is_told_with_its_interval(thesis_model, logged):
+    worse = {f"{k}": replace(thesis_model, theta=thesis_model.theta * k) for k in (0.8, 0.9)}
+    known = {**worse, "true": thesis_model}
+    found = compare(known, logged[0], bands=False)
+    first, last = found.verdict.differences
+    assert (found.verdict.best, first.against, last.against) == ("true", "0.9", "0.8")
+    assert 0 < first.fit.ci[0] < first.fit.after - first.fit.before < first.fit.ci[1]
+    told = found.verdict.sentence
+    assert told.startswith("'true' predicts better than the 2 other models: its mean fit is ")
+    assert f"higher than that of '0.9' by {first.words}. You can predict with it: " in told
+    # the same model is as good as itself, and may be told apart elsewhere
+    found = compare({"a": thesis_model, "b": thesis_model}, logged[0], bands=False)
+    assert "'a' is not better beyond chance than 'b'" in found.verdict.sentence
+    assert "higher by 0.0 (95 %: 0.0 to 0.0)" in found.verdict.sentence
+    steps = [s.command for s in after_comparison(found, [thesis_model] * 2, {})]
+    assert [c.split()[1] for c in steps] == ["predict", "compare"]
+
+
+def test_a_poor_model_is_diagnosed_and_one_that_diverges_is_estimated_anew(thesis_model, logged):
+    poor = replace(thesis_model, theta=thesis_model.theta * 0.1)
+    found = compare({"m": poor}, logged[0], bands=False)
+    assert "Do not predict surge" in found.verdict.sentence
+    (step,) = after_comparison(found, [poor], {"command": {"models": ["m.json"], "log": ["a b"]}})
+    assert step.command.startswith("greybox diagnose 'a b' --vessel V --model m.json")
+    short = compare({"m": poor}, logged[0].window(0, 100), bands=False)
+    (step,) = after_comparison(short, [poor], {})
+    assert step.purpose.startswith("Sail a longer trial, since a diagnosis needs 120 samples")
+    away = replace(thesis_model, theta=-20 * thesis_model.theta)
+    for known in ({"m": away}, {"m": away, "n": away}):
+        found = compare(known, logged[0], bands=False)
+        told = found.verdict.sentence
+        assert ": its free run diverges after " in told
+        assert not found.verdict.differences
+        (step,) = after_comparison(found, list(known.values()), {})
+        assert "--reduce" in step.command
+    found = compare({"m": away, "n": thesis_model}, logged[0], bands=False)
+    assert found.verdict.sentence.startswith(
+        "'n' predicts better than the other model, whose free runs diverge. You can predict with it"
+    )
+
+
+def test_logs_of_an_estimate_say_nothing_of_its_prediction(thesis_model, logged):
+    free, known = logged
+    own = replace(thesis_model, record={"logs": [{"sha256": "a1"}]})
+    found = compare({"m": own}, known, bands=False)
+    assert found.verdict.sentence.startswith(
+        "'m' was estimated on this log, so its fit there (surge "
+    )
+    assert found.notes == (
+        "'m' was estimated on this log: how it fits there says little of other logs.",
+    )
+    (step,) = after_comparison(found, [own], {})
+    assert step.command == "greybox compare MODEL… --log LOG --report compare.html"
+    # a log that none was estimated on judges alone
+    other = replace(thesis_model, theta=0.9 * thesis_model.theta)
+    found = compare({"m": own, "n": other}, [known, free], bands=False)
+    assert not found.verdict.in_sample
+    assert "You can predict with it: on 1 of these 2 logs, kept from every" in (
+        found.verdict.sentence
+    )
+    assert found.verdict.fit == found.runs[0][1].fit
+    # what was estimated on the log has no need to be better there, and is no proof where it is
+    found = compare({"m": own, "n": other}, known, bands=False)
+    assert found.verdict.in_sample == ("m",)
+    assert found.verdict.sentence.startswith("'m' fits better than 'n'")
+    found = compare({"m": replace(other, record=own.record), "n": thesis_model}, known)
+    assert found.verdict.sentence.startswith("'n' predicts better than 'm'")
+
+
+def test_where_nothing_moves_nothing_is_judged(thesis_model, logged):
+    log = logged[0]
+    still = {s: np.full(600, np.mean(log[s])) for s in "uvr"}
+    rng = np.random.default_rng(1)
+    still = {s: y + 0.01 * rng.standard_normal(600) for s, y in still.items()}
+    found = compare({"m": thesis_model}, replace(log, channels={**log.channels, **still}))
+    assert found.verdict.sentence == (
+        "No channel moved beyond its noise, so its prediction was not tested."
+    )
+    (step,) = after_comparison(found, [thesis_model], {})
+    assert step.purpose == "Compare on a log in which the ship moves more"
+
+
+def test_intervals_between_models_hold_for_errors_with_a_memory():
+    """Of models that are equally good, 5 % are told to be better, whatever their errors remember.
+
+    Of 200 that is within 2.6 standard deviations.
+    """
+    rng, false = np.random.default_rng(3), 0
+    log = virtual_log(1, 1000, wind=0.0, current=(0.0, 0.0), noise=0.0, spread=0.0)
+    x = log.states(("u", "v", "r"))
+    for _ in range(200):
+        errors = lfilter([1.0], [1.0, -0.95], rng.standard_normal((2, 3, 1500)))[:, :, 500:]
+        runs = [
+            LogFit(log, x + 0.1 * x.std(axis=0) * e.T, log["psi"], fit_on(log, "uvr", x), -1)
+            for e in errors
+        ]
+        fits = [fit_on(log, "uvr", run.x) for run in runs]
+        one, two = map(stretch_effects, runs)
+        told = gain_over_stretches(*map(mean_fit, fits), [(two - one).mean(axis=0)])
+        false += not told.ci[0] <= 0 <= told.ci[1]
+    assert abs(false - 10) <= 8
 
 
 def test_sign_test_is_binomial():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import DivergenceError, UsageError
+from greybox.errors import DivergenceError, UsageError, so_many
 from greybox.model.run.changes import Change, pieces, require_parameters
 from greybox.model.run.kernels import MANY_RUNS, FreeRunKernel, FreeRunStep, OverRunsKernel
 from greybox.model.run.step import Heading, Integrator, StepModel, held, integrated
@@ -56,7 +56,7 @@ class FreeRun(DisplayMixin):
         runs, samples = self.x.shape[:2]
         gone = int((self.diverged >= 0).sum())
         return (
-            f"{runs} free run{'s'[: runs != 1]} of {samples - 1} steps, "
+            f"{so_many(runs, 'free run')} of {samples - 1} steps, "
             f"{f'{gone} diverged' if gone else 'none diverged'}"
         )
 

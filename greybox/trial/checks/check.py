@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from greybox.errors import LogError, UsageError
+from greybox.errors import LogError, UsageError, so_many
 from greybox.files import real_path
 from greybox.numerics.parallel import map_forked
 from greybox.trial.actuator_estimate import ActuatorEstimate
@@ -337,7 +337,7 @@ def _outcomes(findings: list[Finding], said: dict[str, Outcome]) -> tuple[Outcom
     for kind in IDS:
         if kind in found:
             count = sum(f.id == kind for f in findings)
-            outcomes.append(Outcome(kind, "found", f"{count} finding{'s' if count > 1 else ''}"))
+            outcomes.append(Outcome(kind, "found", so_many(count, "finding")))
         else:
             outcomes.append(said.get(kind, Outcome(kind, "clean", "nothing found")))
     return tuple(outcomes)

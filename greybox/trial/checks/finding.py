@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from greybox.errors import so_many
 from greybox.notebook import DisplayMixin, items, table
 from greybox.trial.actuator_estimate import ActuatorEstimate
 from greybox.trial.raw_log import Recording
@@ -191,7 +192,7 @@ class CheckReport(DisplayMixin):
         """Return the report as text, without remarks that were told, of such findings the size."""
         count = len(self.findings)
         untold = sum(o.status == "cannot tell" for o in self.outcomes)
-        verdict = f"{count} finding{'s' if count > 1 else ''}" if count else "clean"
+        verdict = so_many(count, "finding") if count else "clean"
         if untold and not count:
             verdict = f"nothing found, but {untold} of {len(self.outcomes)} checks cannot tell"
         lines = [f"{self.name}: {verdict}"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import so_many
 from greybox.numerics.robust import robust_deviation
 from greybox.trial.checks.finding import Finding, exact_finding
 from greybox.trial.checks.signal_quality import quantum
@@ -66,7 +67,7 @@ def wrap_findings(recording: Recording) -> list[Finding]:
             ("psi",),
             count,
             "1",
-            f"{len(between)} sample{'s' if len(between) > 1 else ''} of psi "
+            f"{so_many(len(between), 'sample')} of psi "
             f"lie{'' if len(between) > 1 else 's'} between the two sides of the compass's wrap, "
             f"the first at t = {t[k]:.6g} s: {b:.4g} deg on the way from {a:.4g} to {c:.4g} deg, "
             f"as when a heading is interpolated before it is unwrapped",

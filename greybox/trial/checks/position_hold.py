@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import so_many
 from greybox.numerics.robust import robust_deviation
 from greybox.trial.checks.finding import Finding, exact_finding
 from greybox.trial.checks.signal_quality import (
@@ -120,14 +121,13 @@ def hold_findings(recording: Recording) -> list[Finding]:
     rows, longest, missed = held
     t = track.t
     count = float(len(rows))
-    several = len(rows) > 1
     return [
         exact_finding(
             "position_hold",
             ("x_n", "y_n"),
             count,
             "1",
-            f"{len(rows)} position{'s' if several else ''} repeat{'' if several else 's'} the one "
+            f"{so_many(len(rows), 'position', 'repeats', 'repeat')} the one "
             f"before to the last digit under way, the first at t = {t[rows[0]]:.6g} s, most in a "
             f"row {longest[1]} at t = {t[longest[0]]:.6g} s, where the ship went "
             f"{missed:.3g} m meanwhile: the receiver's messages came late",

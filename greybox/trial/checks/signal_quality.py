@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import ANGLES
+from greybox.errors import so_many
 from greybox.numerics.robust import FROM_MEDIAN, robust_deviation
 from greybox.rotation import body_to_ned
 from greybox.trial.checks.finding import Finding, declare_unit, exact_finding
@@ -122,7 +123,7 @@ def _gaps(names: tuple[str, ...], t: Array) -> list[Finding]:
             ("t",),
             size,
             "s",
-            f"{len(wide)} hole{'s' if len(wide) > 1 else ''} in {listed(names)}: no value for more "
+            f"{so_many(len(wide), 'hole')} in {listed(names)}: no value for more "
             f"than {HOLE:g} usual steps of {usual:.4g} s; the longest hole lasts {size:.4g} s from "
             f"t = {t[longest]:.6g} s",
             "none needed: import keeps gaps as gaps, and each stretch becomes a segment",
@@ -167,8 +168,9 @@ def missing_findings(recording: Recording) -> list[Finding]:
                 names,
                 count,
                 "1",
-                f"{int(count)} of {n} samples of {listed(names)} hold no number, in "
-                f"{len(stretches)} stretch{'es' if len(stretches) > 1 else ''}, {where}",
+                f"{int(count)} of {so_many(n, 'sample')} of {listed(names)} "
+                f"{'holds' if count == 1 else 'hold'} no number, in "
+                f"{so_many(len(stretches), 'stretch')}, {where}",
                 "leave them out: import does, and keeps longer stretches as gaps",
                 (mend("drop", names),),
                 True,
@@ -207,7 +209,7 @@ def spike_findings(recording: Recording) -> list[Finding]:
                 size,
                 (size - half, size + half),
                 s.unit or "1",
-                f"{len(spikes)} sample{'s' if len(spikes) > 1 else ''} of {s.name} "
+                f"{so_many(len(spikes), 'sample')} of {s.name} "
                 f"{'stand out from their' if len(spikes) > 1 else 'stands out from its'} "
                 f"neighbours, the largest by {size:.3g} {s.unit} at t = {t[worst]:.6g} s, "
                 f"where the neighbours scatter by {scale:.2g} {s.unit}".rstrip(),
@@ -699,7 +701,8 @@ def time_format_findings(recording: Recording) -> list[Finding]:
                 ("t",),
                 float(len(wrong)),
                 "1",
-                f"{len(wrong)} of {len(t)} times of {listed(names)} lack leading zeros in their "
+                f"{len(wrong)} of {so_many(len(t), 'time')} of {listed(names)} "
+                f"{'lacks' if len(wrong) == 1 else 'lack'} leading zeros in their "
                 f"fraction of a second, the first at t = {meant[0]:.6g} s, written as "
                 f"{written[0]:.6g} s; they come up to {written[worst] - meant[worst]:.3g} s late "
                 f"and seem to go back behind",
@@ -730,7 +733,8 @@ def _padded_text(read: list[Step]) -> Finding:
         ("t",),
         count,
         "1",
-        f"{count:.0f} times of {columns} have fewer digits than the others, such as "
+        f"{so_many(round(count), 'time')} of {columns} {'has' if count == 1 else 'have'} fewer "
+        f"digits than the others, such as "
         f"{said.get('written')} for {said.get('meant')} at t = {times[0]:.6g} s: "
         f"their fraction lacks its leading zeros, and would come up to {late[worst]:.3g} s late",
         "none needed: import reads them as they are meant; export times with all their digits",

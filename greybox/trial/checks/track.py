@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from greybox.errors import so_many
 from greybox.rotation import body_to_ned
 from greybox.trial.checks.course import (
     LEAST_SPEED,
@@ -278,7 +279,7 @@ def _other_unit(ways: _Ways) -> list[Finding]:
     said_so = " and ".join(names)
     evidence = (
         f"the speed over ground of {said_so} is {ratio:.3g} times what the positions make "
-        f"(in {len(rows)} spans of {_SPAN:g} s)"
+        f"(in {so_many(len(rows), 'span')} of {_SPAN:g} s)"
     )
     if len(units) != 1:
         return [

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.notebook import DisplayMixin, items, table
 from greybox.trial.convert.deduplicate import clean_signals
 from greybox.trial.convert.derived_signals import complete_channels, continuous
@@ -65,15 +65,15 @@ class Imported(DisplayMixin):
 
     def summary(self) -> str:
         """Return the segments and notes as text."""
-        rows = [f"  {n}: {t} s, {count} samples" for n, t, count in self._rows()]
+        rows = [f"  {n}: {t} s, {so_many(count, 'sample')}" for n, t, count in self._rows()]
         return "\n".join([self._line(), *rows, *(f"  note: {n}" for n in self.notes)])
 
     def _line(self) -> str:
         first = self.segments[0]
         samples = sum(map(len, self.segments))
         return (
-            f"{len(self.segments)} segment{'s'[: len(self.segments) != 1]} of {first.vessel.name}: "
-            f"{samples} samples every {first.sample_time:g} s"
+            f"{so_many(len(self.segments), 'segment')} of {first.vessel.name}: "
+            f"{so_many(samples, 'sample')} every {first.sample_time:g} s"
         )
 
     def _rows(self) -> list[tuple[str, str, int]]:

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.trial.convert.derived_signals import derive_signals
 from greybox.trial.gaps import usual_step
 from greybox.trial.raw_log import Array, Mask, Recording
@@ -56,7 +56,8 @@ def clean_signals(recording: Recording, origin: tuple[float, float] | None = Non
             s = replace(s, t=t, value=s.value[keep])
         signals.append(s)
     notes = (
-        f"{count} value{'s' if count > 1 else ''} of {name} repeat a time: the first is kept"
+        f"{so_many(count, 'value')} of {name} {'repeats' if count == 1 else 'repeat'} a time: "
+        f"the first is kept"
         for name, count in repeated.values()
     )
     return made.with_signals(signals, *notes)
@@ -122,7 +123,7 @@ def _order(
                 f"{cause or f': {CUT_RUNS}'}."
             )
         notes.append(
-            f"time of {signal} goes back {len(back)} time{'s' if len(back) > 1 else ''}, first "
+            f"time of {signal} goes back {so_many(len(back), 'time')}, first "
             f"from {ordered[back[0]]:.6g} to {ordered[back[0] + 1]:.6g} s: put in order{cause}"
         )
         rows = rows[np.argsort(ordered, kind="stable")]

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import LogError, suggestion
+from greybox.errors import LogError, so_many, suggestion
 from greybox.files import sha256
 from greybox.trial.convert.channel_mapping import (
     beyond_reach,
@@ -286,13 +286,14 @@ def _known_rows(
             if name not in beside:
                 notes.append(
                     f"'{assigned[name].raw}' holds no number in {int((~known).sum())} of "
-                    f"{len(known)} rows: left out"
+                    f"{so_many(len(known), 'row')}: left out"
                 )
             del assigned[name], numbers[name]
         elif not known.any():
             raise LogError(
                 f"column '{assigned[name].raw}' of '{table.path.name}' holds no finite number in "
-                f"{len(known)} rows, from row {table.first_row} on: export it again, or take it "
+                f"{so_many(len(known), 'row')}, from row {table.first_row} on: export it again, "
+                f"or take it "
                 f"out of the file."
             )
     needed = [n for n in numbers if n in {"t", *vessel.commands, *_WIND}]
@@ -303,7 +304,7 @@ def _known_rows(
     first = int(np.flatnonzero(~keep)[0])
     lost = [assigned[n].raw for n in needed if not numbers[n].all()]
     notes.append(
-        f"{int((~keep).sum())} of {len(keep)} rows left out, the first row "
+        f"{int((~keep).sum())} of {so_many(len(keep), 'row')} left out, the first row "
         f"{first + table.first_row}, where {', '.join(lost)} hold{'s' * (len(lost) == 1)} no "
         f"finite number"
     )
@@ -333,7 +334,8 @@ def _require_uniform(
     importer = "recording_from_pandas" if table.format == "DataFrame" else "greybox import"
     if len(t) < MIN_SEGMENT:
         raise LogError(
-            f"'{name}' has {len(t)} samples, at least {MIN_SEGMENT} are needed: use a longer log."
+            f"'{name}' has {so_many(len(t), 'sample')}, at least {MIN_SEGMENT} are needed: use "
+            f"a longer log."
         )
     steps = np.diff(t)
     wrong = np.flatnonzero(steps <= 0)
@@ -359,7 +361,8 @@ def _require_uniform(
             )
         raise LogError(
             f"'{name}' has two sample times: {usual:.6g} s, but {steps[k]:.6g} s after "
-            f"t = {t[k]:.6g} s ({int((off | gaps).sum())} of {len(steps)} steps differ). "
+            f"t = {t[k]:.6g} s ({int((off | gaps).sum())} of {so_many(len(steps), 'step')} "
+            f"differ). "
             f"Resample it to one with {importer}."
         )
     found = [(a, b) for a, b in found if b - a >= MIN_SEGMENT]

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from greybox.channels import LOGGED
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.trial.convert.derived_signals import (
     BODY,
     EARTH,
@@ -189,7 +189,7 @@ def plan_import(
     if samples > _MAX_GROWTH * values + 1000:
         raise LogError(
             f"'{name}' spans {stop - start:.4g} s, {samples:.4g} samples of {sample_time:g} s, but "
-            f"holds {values} values: correct its times, or choose a longer sample time."
+            f"holds {so_many(values, 'value')}: correct its times, or choose a longer sample time."
         )
     shaping = [e for n, e in used.items() if n not in beside]
     longest = max(e.last for e in shaping) - min(e.first for e in shaping)
@@ -217,7 +217,7 @@ def _usable(
 ) -> tuple[dict[str, Extent], list[str]]:
     """Return the signals that the log is made of, and what is said of the others."""
     notes = [
-        f"{n} has {e.count} value{'s' if e.count != 1 else ''}: left out"
+        f"{n} has {so_many(e.count, 'value')}: left out"
         for n, e in extents.items()
         if e.count < MIN_SEGMENT
     ]
@@ -303,15 +303,15 @@ def gap_notes(spans: Sequence[tuple[float, float]], short: int, least: int) -> l
     notes = []
     if short:
         notes.append(
-            f"{short} stretch{'es' if short > 1 else ''} of fewer than {least} samples left out"
+            f"{so_many(short, 'stretch')} of fewer than {least} samples left out"
             f"{', since none can be smoothed' if least > MIN_SEGMENT else ''}"
         )
     gaps = [(a[1], b[0]) for a, b in pairwise(spans)]
     if gaps:
         begin, end = max(gaps, key=lambda gap: gap[1] - gap[0])
         notes.append(
-            f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''} kept as such, the longest of "
-            f"{end - begin:.3g} s at t = {begin:.6g} s: {len(spans)} segments"
+            f"{so_many(len(gaps), 'gap')} kept as such, the longest of "
+            f"{end - begin:.3g} s at t = {begin:.6g} s: {so_many(len(spans), 'segment')}"
         )
     return notes
 
@@ -320,7 +320,7 @@ def too_short(plan: Plan) -> LogError:
     """Return the error of a plan without a segment."""
     other = " or a shorter window of smoothing" if plan.least > MIN_SEGMENT else ""
     return LogError(
-        f"'{plan.name}' has {plan.count} samples of {plan.sample_time:g} s but no "
+        f"'{plan.name}' has {so_many(plan.count, 'sample')} of {plan.sample_time:g} s but no "
         f"{plan.least} that follow each other in which "
         f"{', '.join(plan.reference_channels)} all have values (two more where "
         f"velocities are derived): choose another sample time{other}, or bridge longer "

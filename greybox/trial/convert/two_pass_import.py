@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.files import sha256
 from greybox.trial.convert.channel_mapping import (
     angle_reach,
@@ -141,13 +141,12 @@ def scan_table(table: TableFile, vessel: Vessel, options: ImportOptions) -> Scan
     ]
     if found.backward:
         notes.append(
-            f"time goes back {found.backward} time{'s' if found.backward > 1 else ''}, by "
+            f"time goes back {so_many(found.backward, 'time')}, by "
             f"{found.back:.6g} s at most: put in order"
         )
     if found.repeated:
         notes.append(
-            f"{found.repeated} row{'s' if found.repeated > 1 else ''} repeat a time: "
-            f"the first is kept"
+            f"{so_many(found.repeated, 'row', 'repeats', 'repeat')} a time: the first is kept"
         )
     said = (*notes, *plan.notes)
     return Scan(

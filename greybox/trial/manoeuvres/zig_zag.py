@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.notebook import DisplayMixin
 from greybox.trial.manoeuvres.approach import first_notes, measure_approach
 from greybox.trial.manoeuvres.local import crossing, fit_at, peak
@@ -111,7 +111,9 @@ class ZigZag(DisplayMixin):
 
     def summary(self) -> str:
         """Return the measured values, verdicts and notes as text."""
-        where = f"from {self.start:.1f} to {self.stop:.1f} s, {len(self.executes)} executes"
+        where = (
+            f"from {self.start:.1f} to {self.stop:.1f} s, {so_many(len(self.executes), 'execute')}"
+        )
         rows: list[tuple[str, Quantity | None]] = [("approach speed", self.approach_speed)]
         checks = list(zip(self.overshoots, self.check_times, strict=True))
         # one more is told as they are, several by their range
@@ -180,7 +182,10 @@ def measure_zigzag(
         Fewer than two executes, or one outside the log.
     """
     if len(executes) < 2:
-        raise LogError(f"a zig-zag has at least 2 executes, {len(executes)} were given.")
+        raise LogError(
+            f"a zig-zag has at least 2 executes, {len(executes)} "
+            f"{'was' if len(executes) == 1 else 'were'} given."
+        )
     start = float(executes[0])
     stop = float(t[-1]) if stop is None else stop
     if not start < executes[-1] < stop <= t[-1]:

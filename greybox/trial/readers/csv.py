@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.layout import Layout, find_layout
 from greybox.trial.readers.limits import limits
@@ -93,7 +93,8 @@ class CsvFile(Layout):
             if isinstance(error, LogError):
                 raise
             raise LogError(
-                f"cannot read '{self.path.name}' as CSV after {rows} rows: {_reason(error)}. "
+                f"cannot read '{self.path.name}' as CSV after {so_many(rows, 'row')}: "
+                f"{_reason(error)}. "
                 f"Cut the file before that place, or export it again."
             ) from None
         if clean.unfinished:
@@ -101,23 +102,25 @@ class CsvFile(Layout):
         count, quoted = broken["rows"], broken["quoted"]
         if quoted > rows:
             raise LogError(
-                f"{quoted} of {count + quoted + rows} rows of '{self.path.name}' stand inside a "
+                f"{quoted} of {so_many(count + quoted + rows, 'row')} of '{self.path.name}' "
+                f"{'stands' if quoted == 1 else 'stand'} inside a "
                 f"quoted cell whose quote is never closed: take the quote out, or export it again."
             )
         if count > rows:
             raise LogError(
-                f"{count} of {count + rows} rows of '{self.path.name}' have another number of "
+                f"{count} of {so_many(count + rows, 'row')} of '{self.path.name}' "
+                f"{'has' if count == 1 else 'have'} another number of "
                 f"fields than the {len(self.columns)} of its header: give every column a name, "
                 f"or export it again."
             )
         if quoted:
             self._note(
-                f"{quoted} row{'s' if quoted > 1 else ''} inside a quoted cell whose quote is not "
+                f"{so_many(quoted, 'row')} inside a quoted cell whose quote is not "
                 f"closed in its row left out"
             )
         if count:
             self._note(
-                f"{count} row{'s' if count > 1 else ''} with another number of fields than the "
+                f"{so_many(count, 'row')} with another number of fields than the "
                 f"{len(self.columns)} of the header left out"
             )
         # the file may be read twice
@@ -126,10 +129,7 @@ class CsvFile(Layout):
             self._note(f"{step.source[0]}: {step.sentence}")
         for name, lost in words.items():
             what = "what is no time" if name in stamps else "words"
-            self._note(
-                f"column '{name}' holds {what} in {lost} row{'s' if lost > 1 else ''}: "
-                f"read as missing"
-            )
+            self._note(f"column '{name}' holds {what} in {so_many(lost, 'row')}: read as missing")
 
     def _note(self, note: str) -> None:
         # the file may be read twice

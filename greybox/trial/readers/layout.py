@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.trial.readers import cells
 from greybox.trial.readers.limits import limits
 from greybox.units import spelled_unit
@@ -149,10 +149,11 @@ def find_layout(path: Path) -> Layout:
         if at[header]:
             count = sum(bool(line.strip()) for line in lines[: at[header]])
             if count:
-                notes.append(f"{count} line{'s' if count > 1 else ''} before the header skipped")
+                notes.append(f"{so_many(count, 'line')} before the header skipped")
     if split.first_row >= len(split.rows):
         raise LogError(
-            f"'{path.name}' has a header line of {len(names)} names but no rows below it: "
+            f"'{path.name}' has a header line of {so_many(len(names), 'name')} but no rows "
+            f"below it: "
             f"name a log with samples."
         )
     names = names + [""] * (split.width - len(names))
@@ -296,14 +297,15 @@ def _no_header(path: Path, split: _Split) -> LogError:
         shown = ", ".join(c[:20] for c in first[:4])
         return LogError(
             f"'{path.name}' begins with numbers ({shown}{', …' if len(first) > 4 else ''}) and "
-            f"has no header line: add one that names the {len(first)} columns."
+            f"has no header line: add one that names the {so_many(len(first), 'column')}."
         )
     names = next((r for k, r in enumerate(split.rows) if split.header_like(k)), first)
     more = ""
     if split.delimiter == "," and split.width in (2 * len(names), 2 * len(names) - 1):
         more = ", or part the fields with semicolons if the commas are decimal ones"
     return LogError(
-        f"'{path.name}' has {len(names)} names in its header and {split.width} fields in its "
+        f"'{path.name}' has {so_many(len(names), 'name')} in its header and "
+        f"{so_many(split.width, 'field')} in its "
         f"rows: give every column a name{more}."
     )
 
@@ -327,7 +329,10 @@ def _unique(names: list[str], notes: list[str]) -> tuple[str, ...]:
         found.append(new)
     notes += renamed[:_MAX_NOTED]
     if len(renamed) > _MAX_NOTED:
-        notes.append(f"{len(renamed) - _MAX_NOTED} more columns have the name of another")
+        notes.append(
+            so_many(len(renamed) - _MAX_NOTED, "more column", "has", "have")
+            + " the name of another"
+        )
     return tuple(found)
 
 

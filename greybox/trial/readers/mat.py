@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import LogError, suggestion
+from greybox.errors import LogError, so_many, suggestion
 from greybox.files import sha256
 from greybox.trial.raw_log import Array, Recording, Signal, SourceFile, free_name, shortened
 from greybox.trial.readers.limits import limits
@@ -347,7 +347,7 @@ def _inventory(tree: Tree) -> str:
         if isinstance(value, dict):
             words.append(f"{name} (struct with {shortened(value, 6)})")
         elif isinstance(value, list):
-            words.append(f"{name} ({len(value)} cells)")
+            words.append(f"{name} ({so_many(len(value), 'cell')})")
         elif isinstance(value, (str, Unreadable)):
             words.append(f"{name} ({'text' if isinstance(value, str) else 'unreadable'})")
         else:

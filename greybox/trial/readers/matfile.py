@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.trial.readers.limits import limits
 from greybox.trial.readers.mat_process import (
     COMPLEX,
@@ -51,7 +51,7 @@ def load_tree(path: Path) -> tuple[Tree, str]:
         if head.startswith(_HDF) or head[512:] == _HDF:
             return _load_hdf(path), "MAT 7.3"
         if len(head) < 20:
-            raise MalformedError(f"has only {len(head)} bytes")
+            raise MalformedError(f"has only {so_many(len(head), 'byte')}")
         four = 0 in head[:4]
         if not four and head[126:128] not in (b"IM", b"MI"):
             raise MalformedError("does not begin like a MATLAB file")

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.files import sha256
 from greybox.trial.raw_log import Array, Recording, Signal, SourceFile
 from greybox.trial.readers.limits import limits
@@ -524,7 +524,8 @@ def _recording(path: Path, stream: _Stream) -> Recording:
     signals = [s for s in signals if len(s)]
     if not signals:
         raise LogError(
-            f"'{path.name}' has {len(tags)} times but no value that belongs to one of them: "
+            f"'{path.name}' has {so_many(len(tags), 'time')} but no value that belongs to one "
+            f"of them: "
             f"name a file of sentences such as GGA, HDT."
         )
     first = min(float(s.t.min()) for s in signals)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from greybox.errors import LogError
+from greybox.errors import LogError, so_many
 from greybox.trial.readers import cells as cell_text
 from greybox.trial.readers.limits import limits
 from greybox.trial.readers.table import Batch
@@ -142,7 +142,8 @@ def open_parquet(path: Path) -> ParquetFile:
     size = path.stat().st_size
     if rows > max(limits().sure_rows, limits().rows_per_byte * size):
         raise LogError(
-            f"'{path.name}' states {rows} rows in {size} bytes, at most {limits().rows_per_byte} a "
+            f"'{path.name}' states {so_many(rows, 'row')} in {so_many(size, 'byte')}, at most "
+            f"{limits().rows_per_byte} a "
             f"byte are believed: export it again from the recorder."
         )
     kinds: dict[str, str] = {}
@@ -164,12 +165,15 @@ def open_parquet(path: Path) -> ParquetFile:
         )
     if not kinds or not rows:
         raise LogError(
-            f"'{path.name}' holds {rows} rows and {len(kinds)} columns of numbers, times or text: "
+            f"'{path.name}' holds {so_many(rows, 'row')} and {so_many(len(kinds), 'column')} of "
+            f"numbers, times or text: "
             f"name a log with samples."
         )
     notes = [f"column '{n}' is neither number, time nor text: left out" for n in dropped[:5]]
     if len(dropped) > 5:
-        notes.append(f"{len(dropped) - 5} more columns that are neither left out")
+        notes.append(
+            so_many(len(dropped) - 5, "more column", "that is", "that are") + " neither left out"
+        )
     text = [n for n, k in kinds.items() if k == "text"]
     parsed = _written_dates(path, text)
     return ParquetFile(

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from greybox.errors import so_many
 from greybox.notebook import with_error
 from greybox.numerics.parallel import map_forked
 from greybox.trial.checks.finding import Finding, Outcome
@@ -260,7 +261,7 @@ def _judged(finding: Finding, d: Defect, campaign: Campaign, vessel: Vessel) -> 
         finding = replace(finding, logs=campaign.names)
     if campaign.others and _differs(d, campaign.pooled):
         evidence += (
-            f"; {campaign.others} other log{'s' if campaign.others > 1 else ''} of the ship "
+            f"; {so_many(campaign.others, 'other log')} of the ship "
             f"{'have' if campaign.others > 1 else 'has'} another value"
         )
     ask = ""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from greybox.channels import CHANNELS
-from greybox.errors import LogError, suggestion
+from greybox.errors import LogError, so_many, suggestion
 from greybox.files import sha256
 from greybox.trial.raw_log import Array, Recording, Signal, SourceFile, free_name, shortened
 from greybox.trial.readers.limits import limits
@@ -251,8 +251,9 @@ class _Topic:
         topic = self.channel.topic
         if self.unstamped:
             notes.append(
-                f"{self.unstamped} of {len(logged)} messages of '{topic}' carry no time in their "
-                f"header: the recorder's time was used for those."
+                f"{self.unstamped} of {so_many(len(logged), 'message')} of '{topic}' "
+                f"{'carries' if self.unstamped == 1 else 'carry'} no time in the header: the "
+                f"recorder's time was used for those."
             )
         if not self.stamped:
             return logged
@@ -372,7 +373,8 @@ def _named(
         if keeper is topic:
             return name, True
         notes.append(
-            f"'{name}' is that of '{keeper.channel.topic}' ({len(keeper.logged)} messages); that "
+            f"'{name}' is that of '{keeper.channel.topic}' "
+            f"({so_many(len(keeper.logged), 'message')}); that "
             f"of '{topic.channel.topic}' ({len(topic.logged)}) is called '{topic.dotted}.{name}'."
         )
     alone = name == "data" and topic.channel.msgtype.startswith("std_msgs/")
@@ -384,7 +386,7 @@ def _remark(topic: _Topic, notes: list[str]) -> None:
     for remark in topic.remarks:
         notes.append(f"{label}: {remark}.")
     for reason, count in topic.skipped.items():
-        notes.append(f"{label}: {count} messages were skipped: {reason}.")
+        notes.append(f"{label}: {so_many(count, 'message', 'was', 'were')} skipped: {reason}.")
 
 
 def _check_rules(topics: list[_Topic]) -> None:
