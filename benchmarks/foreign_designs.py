@@ -12,8 +12,9 @@ again. `whole` is one plan of 15 min, `stages` three of 5 min, the later ones ma
 those before. With `--prior none` there is no first trial: plans begin with main dimensions. What
 stands in DIR is not made again. Errors are those of free runs over one long trial of the operating
 envelope: random steps, zig-zags and turns, to both sides at all speeds. Coefficients are compared
-as linear derivatives on a straight course, which every simulator has: slopes of sway and yaw
-accelerations in sway, yaw rate and turn of the helm, by differences on both sides.
+as linear derivatives, which every simulator has: slopes of sway and yaw accelerations in sway and
+yaw rate, by differences on both sides; on a straight course with those in the turn of the helm, and
+at motions all along the trial of the envelope.
 """
 
 from __future__ import annotations
@@ -74,6 +75,8 @@ JUDGED = 200
 # share of full ahead on the straight course of linear derivatives, and steps from it: of speeds
 # as a share of the ship's own, of the helm as one of 35 degrees
 AHEAD, STEP, HELM = 0.75, 0.02, 0.1
+# motions along the trial of the envelope at which they are compared too
+MOTIONS = 24
 # lengths at service speed after which a course is steady
 COURSE = 40
 # plans that are made one after another, and the duration of each [s]
@@ -217,26 +220,35 @@ def vessel_file(name: str, *, dimensions: bool) -> str:
     return "\n".join([*first, ship.vessel_toml(), "[conditions]", f"draught = {ship.draught:g}\n"])
 
 
-def derivatives(
+def slopes(
+    rates: Callable[[Array, Sequence[float]], Array],
+    at: Sequence[tuple[Array, Sequence[float]]],
+    speed: float,
+    scale: float,
+) -> Array:
+    """Return slopes of sway and yaw accelerations in sway and yaw rate at some motions, (n, 2, 2).
+
+    In speeds, lengths and lengths sailed; `scale` is the time of one [s].
+    """
+    steps = STEP * np.array([speed, 1 / scale])
+    apart = [
+        [rates(x + d, commands)[1:3] - rates(x - d, commands)[1:3]
+         for d in np.column_stack([np.zeros(2), np.diag(steps)])]
+        for x, commands in at
+    ]  # fmt: skip
+    rows = np.array([speed / scale, 1 / scale**2])
+    return np.asarray(np.swapaxes(apart, 1, 2) / (2 * STEP) / rows[:, None])
+
+
+def on_course(
     name: str, rates: Callable[[Array, Sequence[float]], Array], course: Array, scale: float
 ) -> Array:
-    """Return slopes (2, 3) of sway and yaw accelerations in sway, yaw rate and turn of the helm.
-
-    In speeds of the course, lengths and lengths sailed; `scale` is the time of one [s].
-    """
+    """Return the slopes on a straight course in sway, yaw rate and turn of the helm, (2, 3)."""
     ship, speed = presets()[name].ship, course[0]
+    (motion,) = slopes(rates, [(course, ship.helm(AHEAD, 0.0))], speed, scale)
+    turned = [rates(course, ship.helm(AHEAD, side * HELM))[1:3] for side in (1.0, -1.0)]
     rows = np.array([speed / scale, 1 / scale**2])
-    found = np.empty((2, 3))
-    for k in range(3):
-        apart = []
-        for side in (1.0, -1.0):
-            x = course.copy()
-            if k < 2:
-                x[1 + k] = side * STEP * (speed, 1 / scale)[k]
-            turn = side * HELM if k == 2 else 0.0
-            apart.append(rates(x, ship.helm(AHEAD, turn))[1:3])
-        found[:, k] = (apart[0] - apart[1]) / (2 * (STEP, STEP, HELM)[k]) / rows
-    return found
+    return np.column_stack([motion, (turned[0] - turned[1]) / (2 * HELM) / rows])
 
 
 def model_rates(model: ManoeuvringModel) -> Callable[[Array, Sequence[float]], Array]:
@@ -257,26 +269,38 @@ def model_rates(model: ManoeuvringModel) -> Callable[[Array, Sequence[float]], A
     return rates
 
 
-def coefficient_errors(folder: Path, name: str, arms: Mapping[str, object]) -> dict[str, float]:
+def coefficient_errors(
+    folder: Path, name: str, arms: Mapping[str, object]
+) -> dict[str, tuple[float, float]]:
     """Return by how much linear derivatives of each arm's model are off, as a share of their size.
 
-    nan where an arm has no model.
+    On a straight course, and over the trial of the envelope; nan where an arm has no model.
     """
     ship = presets()[name].ship
     sailed = presets()[name].sail(steady(AHEAD), COURSE * ship.time_scale)
     course = np.array([float(sailed.true["u"][-1]), 0.0, 0.0])
     scale = ship.length / course[0]
+    log = np.genfromtxt(folder / "held-out.csv", delimiter=",", names=True)
+    log = log[np.linspace(0, len(log) - 1, MOTIONS + 1).astype(int)[1:]]
+    motions = [
+        (np.array([row[n] for n in ("u", "v", "r")]), [row[a.column] for a in ship.actuators])
+        for row in log
+    ]
 
     def rates(x: Array, commands: Sequence[float]) -> Array:
         return np.array(ship.accelerations(x, commands, (0.0, 0.0, 0.0)))
 
-    true, off = derivatives(name, rates, course, scale), {}
+    def both(rates: Callable[[Array, Sequence[float]], Array]) -> tuple[Array, Array]:
+        return on_course(name, rates, course, scale), slopes(rates, motions, course[0], scale)
+
+    true, off = both(rates), {}
     for arm in arms:
         path = folder / f"{arm}.json"
-        off[arm] = float("nan")
+        off[arm] = (float("nan"), float("nan"))
         if path.exists():
-            slopes = derivatives(name, model_rates(load_model(path)), course, scale)
-            off[arm] = float(np.linalg.norm(slopes - true) / np.linalg.norm(true))
+            found = zip(both(model_rates(load_model(path))), true, strict=True)
+            first, second = (float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in found)
+            off[arm] = first, second
     return off
 
 
@@ -310,20 +334,23 @@ def paired(logs: Array) -> str:
 
 
 def row(
-    name: str, cases: Sequence[dict[str, list[float]]], base: str, off: Sequence[dict[str, float]]
+    name: str,
+    cases: Sequence[dict[str, list[float]]],
+    base: str,
+    off: Sequence[dict[str, tuple[float, float]]],
 ) -> str:
     """Return mean fits, and errors of each other kind of trial over those of `base`.
 
-    First of free runs, then of linear derivatives.
+    First of free runs, then of linear derivatives on a course and over the envelope.
     """
     fits = {arm: np.array([c[arm] for c in cases]) for arm in cases[0]}
     means = "".join(f"{np.nanmean(f):>12.1f}" for f in fits.values())
     # geometric mean over the states of the rms error in the deviation of each
     errors = {arm: np.log(np.maximum(1 - f / 100, 1e-6)).mean(axis=1) for arm, f in fits.items()}
     others = [arm for arm in errors if arm not in ("first", base)] if base else []
-    slopes = {arm: np.log([o[arm] for o in off]) for arm in errors}
+    both = [{arm: np.log([o[arm][k] for o in off]) for arm in errors} for k in range(2)]
     told = "".join(
-        f"   {paired(of[arm] - of[base]):<24}" for of in (errors, slopes) for arm in others
+        f"   {paired(of[arm] - of[base]):<24}" for of in (errors, *both) for arm in others
     )
     return f"{name:<24}{means}{told}".rstrip()
 
@@ -338,7 +365,7 @@ def main() -> None:
     options = parser.parse_args()
     dimensions = options.prior == "none"
     found: dict[str, list[dict[str, list[float]]]] = {name: [] for name in options.ships}
-    off: dict[str, list[dict[str, float]]] = {name: [] for name in options.ships}
+    off: dict[str, list[dict[str, tuple[float, float]]]] = {name: [] for name in options.ships}
     for seed in options.seeds:
         for name in options.ships:
             found[name].append(case(options.out, name, seed, options.arms, dimensions=dimensions))
@@ -351,8 +378,8 @@ def main() -> None:
     sailed = [*(() if dimensions else ("first",)), *options.arms]
     others = [arm for arm in options.arms if arm != base] if base else []
     print(f"{'mean held-out fit [%]':<24}" + "".join(f"{arm:>12}" for arm in sailed)
-          + "".join(f"   {f'{x} over {base}':<24}" for x in others * 2)
-          + f"   (errors of {len(others)}, then of their derivatives)")  # fmt: skip
+          + "".join(f"   {f'{x} over {base}':<24}" for x in others * 3)
+          + f"   (errors of {len(others)}, then of their derivatives, twice)")  # fmt: skip
     for name, cases in found.items():
         print(row(name, cases, base, off[name]))
     told = sorted(options.out.glob("*/limited.kept")) if "limited" in options.arms else []

@@ -74,14 +74,16 @@ def test_pairs_with_a_failed_trial_are_told_by_their_number(monkeypatch):
     designs = import_module("benchmarks.foreign_designs")
     case = {arm: [80.0, 80.0, 80.0] for arm in ("first", *designs.ARMS)}
     cases = [case, case | {"random": [60.0] * 3}, case | {"zigzag": [np.nan] * 3}]
-    off = [dict.fromkeys(case, 0.2) for _ in cases]
-    off[1]["random"] = 0.4
+    off = [dict.fromkeys(case, (0.2, 0.3)) for _ in cases]
+    off[1]["random"] = (0.4, 0.3)
     told = designs.row("ship", cases, "plan", off)
     assert "1.26 (0.47 to 3.40) n=3" in told
     assert "1.00 (1.00 to 1.00) n=2" in told
-    # of linear derivatives, after those of free runs
-    assert told.endswith("1.00 (1.00 to 1.00) n=3")
-    assert "(0.47 to 3.40)" in told.split("n=3", 2)[2]
+    # of linear derivatives on a course, and over the envelope, after those of free runs
+    others = len(designs.ARMS) - 1
+    course, envelope = (told.split("   ")[k * others :] for k in (-2, -1))
+    assert "(0.47 to 3.40)" in " ".join(course)
+    assert {x.strip() for x in envelope if x} == {"1.00 (1.00 to 1.00) n=3"}
 
 
 def test_linear_derivatives_are_those_of_the_simulator(monkeypatch):
@@ -98,8 +100,13 @@ def test_linear_derivatives_are_those_of_the_simulator(monkeypatch):
         # what is even in the motion has no slope on a straight course
         return np.append(0.0, sizes * (told + 5 * x[1] ** 2))
 
-    found = designs.derivatives("kvlcc2-7m", rates, np.array([speed, 0.0, 0.0]), scale)
+    course = np.array([speed, 0.0, 0.0])
+    found = designs.on_course("kvlcc2-7m", rates, course, scale)
     np.testing.assert_allclose(found, made, atol=1e-9)
+    drifting = [(course + [0.0, v, 0.0], ship.helm(0.5, 0.3)) for v in (-0.1, 0.2)]
+    across, back = designs.slopes(rates, drifting, speed, scale)
+    np.testing.assert_allclose(across, made[:, :2] + [[-1.0, 0.0]] * 2, atol=1e-9)
+    np.testing.assert_allclose(back, made[:, :2] + [[2.0, 0.0]] * 2, atol=1e-9)
 
 
 def test_an_alternative_that_fails_is_not_called_one_that_is_missing(monkeypatch):
