@@ -341,6 +341,7 @@ def test_no_command_writes_over_what_it_reads(tmp_path, capsys):
     assert "which out names too" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_columns_in_another_unit_are_told_by_every_command_that_reads_logs(tmp_path, capsys):
     columns = recorded(5, rate=1.0)
     columns |= {n: np.degrees(columns[n]) for n in ("psi", "alpha1")}

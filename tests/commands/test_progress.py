@@ -254,6 +254,7 @@ def test_every_stage_is_told_by_something() -> None:
     assert found > 30
 
 
+@pytest.mark.long
 def test_a_check_on_a_terminal_tells_the_time_that_is_left(noisy_csv: Path) -> None:
     page = str(noisy_csv.with_suffix(".html"))
     given = ["-m", "greybox", "check", str(noisy_csv), "--vessel", "thesis", "--report", page]

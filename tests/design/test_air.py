@@ -56,6 +56,7 @@ def test_gusts_are_of_regressors_alone():
         wind_request(gust=2.0, **asked)
 
 
+@pytest.mark.long
 def test_where_no_random_sequence_keeps_a_margin_a_steady_course_is_moved():
     problem = build_problem(wind_request(0.6))
     assert random_campaign([problem], 0) == (None, 0)

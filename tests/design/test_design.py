@@ -633,6 +633,7 @@ def good():
     return design_trial(make_request(duration=120.0, effort=0.1), workers=1, alternatives=False)
 
 
+@pytest.mark.long
 def test_a_design_starts_from_what_it_is_given(good):
     request = make_request(duration=120.0, effort=0.02)
     again = design_trial(request, workers=1, alternatives=False, first=good.levels)

@@ -634,6 +634,7 @@ def test_the_closest_plan_where_no_other_is_found(model) -> None:
     assert design.missed()[0].startswith("the sea room is missed by ")
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("hasty")
 def test_the_closest_plan_to_a_margin_out_of_reach(model) -> None:
     """It says which margin it keeps, and is held against the one that was asked for."""

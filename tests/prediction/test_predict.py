@@ -187,6 +187,7 @@ def test_both_sides_of_a_symmetric_ship_are_equal():
         assert quantity.interval == pytest.approx(other.quantities[name].interval, rel=1e-6)
 
 
+@pytest.mark.long
 def test_criteria_are_judged_by_the_interval():
     """Twice the tactical diameter that is allowed fails, well below it meets."""
     wide = dict(RUDDER, **{"N_|u|u*rudder": 0.0012})

@@ -34,7 +34,7 @@ from greybox.validation.comparison import compare
 from greybox.validation.gain import Gain
 from greybox.vessel.toml import load_vessel
 
-PAGES = ("estimate", "compare", "check", "predict", "design", "diagnose", "demo", "fleet")
+PAGES = ("estimate", "compare", "check", "predict", "design", "diagnose", "fleet", "demo")
 # pixels: what a laptop shows of a page without scrolling
 SCREEN = (1280, 800)
 PHONE = 390
@@ -123,7 +123,9 @@ _LOWEST = """
 _WIDE = "const e = document.documentElement; return [e.scrollWidth, e.clientWidth]"
 
 
-@pytest.mark.parametrize("written", PAGES, indirect=True)
+@pytest.mark.parametrize(
+    "written", [*PAGES[:-1], pytest.param(PAGES[-1], marks=pytest.mark.long)], indirect=True
+)
 def test_the_first_screen(written):
     """Verdict, picture and next step need no scrolling; a phone scrolls down only."""
     with driven(written) as browser:
