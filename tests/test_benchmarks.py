@@ -103,7 +103,7 @@ def test_linear_derivatives_are_those_of_the_simulator(monkeypatch):
     course = np.array([speed, 0.0, 0.0])
     found = designs.on_course("kvlcc2-7m", rates, course, scale)
     np.testing.assert_allclose(found, made, atol=1e-9)
-    drifting = [(course + [0.0, v, 0.0], ship.helm(0.5, 0.3)) for v in (-0.1, 0.2)]
+    drifting = [(np.add(course, [0.0, v, 0.0]), ship.helm(0.5, 0.3)) for v in (-0.1, 0.2)]
     across, back = designs.slopes(rates, drifting, speed, scale)
     np.testing.assert_allclose(across, made[:, :2] + [[-1.0, 0.0]] * 2, atol=1e-9)
     np.testing.assert_allclose(back, made[:, :2] + [[2.0, 0.0]] * 2, atol=1e-9)
