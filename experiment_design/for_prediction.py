@@ -158,14 +158,14 @@ class PredictionDesign:
         elif self.missed:
             shares = ", ".join(f"{n} {100 * share:.0f} %" for n, share in self.missed.items())
             said += (
-                f". These errors hold for a ship that the prior's structure fits. The prior has "
-                f"no verdict on its predictions: what its free runs missed of logs that its "
-                f"diagnosis held out ({shares} of the spread) is taken to stay after the trial"
+                f". These errors hold for a ship that the prior's structure fits. Only its "
+                f"diagnosis tried the prior on logs that it was not estimated on: what its runs "
+                f"missed there ({shares} of the spread) is taken to stay after the trial"
             )
         elif not self.level:
             said += (
-                f". These errors hold for a ship that the prior's structure fits. The prior has "
-                f"no verdict on its predictions: it is assumed to miss "
+                f". These errors hold for a ship that the prior's structure fits. The prior was "
+                f"never tried on logs that it was not estimated on: it is assumed to miss "
                 f"{100 * _UNKNOWN_MISFIT:.0f} % of each spread, most of which the trial tells, so "
                 f"take these numbers as a guess"
             )

@@ -220,7 +220,9 @@ def _coverage(state: str, share: float, usual: Array) -> Coverage:
         f"({100 * low:.0f}-{100 * high:.0f} % usual)"
     )
     if share < low:
-        sentence += ": something that the model lacks moves the ship, or the ship has changed since"
+        sentence += (
+            ": the model lacks something that its bands do not allow for, or the ship has changed"
+        )
     elif share > high:
         sentence += ": this log is quieter than those that the model was estimated on"
     return Coverage(share, (low, high), sentence + ".")

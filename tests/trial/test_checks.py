@@ -218,7 +218,7 @@ def test_without_a_velocity_sensor_a_bias_cannot_be_told(ship):
     assert not report.findings
     said = {o.id: o for o in report.outcomes}
     assert said["heading_bias"].status == "cannot tell"
-    assert "no velocity sensor of its own" in said["heading_bias"].sentence
+    assert "no measured u and v" in said["heading_bias"].sentence
 
 
 @pytest.mark.parametrize(
@@ -243,7 +243,7 @@ def test_without_a_velocity_sensor_the_course_tells_heading_from_rate(name, wide
 @pytest.mark.parametrize(
     ("gone", "status", "said"),
     [
-        (("u", "v"), "cannot tell", "no velocity sensor of its own to compare the positions with"),
+        (("u", "v"), "cannot tell", "no measured u and v to compare the positions with"),
         (("x_n", "y_n"), "cannot tell", "no positions to compare the velocities with"),
         (("u", "v", "x_n", "y_n"), "clean", "heading and yaw rate share a clock"),
     ],

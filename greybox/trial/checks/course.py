@@ -1,6 +1,6 @@
 """Course against heading: a compass that points elsewhere than the vessel goes.
 
-Where no velocity sensor of its own can judge the compass, the course must keep to the bow.
+Where no measured u and v can judge the compass, the course must keep to the bow.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def course_findings(recording: Recording, vessel: Vessel) -> tuple[list[Finding]
     def untold(why: str) -> tuple[list[Finding], list[Outcome]]:
         return [], [Outcome("heading_bias", "cannot tell", why)]
 
-    vague = "the log has no velocity sensor of its own, only course and heading"
+    vague = "the log has no measured u and v, only course over ground and heading"
     course = make_course(recording)
     if course is None:
         return untold("needs positions and heading")

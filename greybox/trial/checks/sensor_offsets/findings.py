@@ -387,7 +387,7 @@ def _heading_clock_outcome(campaign: Campaign, together: str) -> Outcome:
     said = f"heading and yaw rate share a clock{together}"
     logged = {n for r in campaign.recordings for n in r.names}
     if "x_n" in logged:
-        lacks, alone = "velocity sensor of its own", "the positions"
+        lacks, alone = "measured u and v", "the positions"
     elif logged & {"u", "v"}:
         lacks, alone = "positions", "the velocities"
     else:
