@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import needs_browser
 
 import greybox
 from greybox.commands.main import build_parser, main
@@ -206,6 +207,21 @@ def test_broken_links_are_found(tmp_path):
         "c.html: there is no 'gone.png'",
         "c.html: 'http://nosite' names no site",
     ]
+
+
+@needs_browser
+def test_pages_that_are_cut_off_are_found(tmp_path, capsys):
+    pages = module_of(DOCS / "check_pages.py")
+    (tmp_path / "good.html").write_text("<p>short</p>")
+    assert pages.main(tmp_path) == 0
+    assert "1 page opened in a browser: nothing is cut off" in capsys.readouterr().out
+    wide = '<p style="width: 800px">much</p><script>console.error("oh")</script>'
+    (tmp_path / "wide.html").write_text(wide)
+    assert pages.main(tmp_path) == 3
+    told = capsys.readouterr().out
+    assert '"oh"' in told
+    assert "wide.html: on a phone of 390 px it scrolls sideways by " in told
+    assert "wide.html: cut off on A4: P: much" in told
 
 
 def test_documentation_speaks_of_itself_alone():
